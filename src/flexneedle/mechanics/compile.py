@@ -70,12 +70,27 @@ class _InnerDispatcher(CPUDispatcher):
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that only kernels call and that allocates no array.
+    """Compile a function that only kernels call and that allocates no array, into each of its callers.
 
-    Its caller owns the arrays: counting references to them would take a third of a step.
+    In a call, lanes would pass through memory, which would take a third of a step.
     """
+    return _compile_inner(function, forceinline=True)
+
+
+def shared(function: _Function) -> _Function:
+    """Compile a large function as `inner` does, but once for all of its callers."""
+    return _compile_inner(function, forceinline=False)
+
+
+def _compile_inner(function: _Function, *, forceinline: bool) -> _Function:
+    # Without a count of references, which would take a third of a step: an array that it returns would be freed.
     compiled: Any = _njit(
-        nogil=True, error_model="numpy", _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
+        nogil=True,
+        error_model="numpy",
+        forceinline=forceinline,
+        _nrt=False,
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
     )(function)
     compiled.__class__ = _InnerDispatcher
     return compiled

@@ -2,7 +2,7 @@
 
 import math
 
-from flexneedle.mechanics.compile import inner
+from flexneedle.mechanics.compile import inner, shared
 from flexneedle.mechanics.lanes import least, load, most, select, some, store, whole
 from flexneedle.mechanics.lateral import Lateral, lateral, rotate, times
 from flexneedle.mechanics.needle import Boundary, Cut, CutChannel, Equilibrium, NeedleState, NodePose
@@ -34,7 +34,7 @@ def _move_boundary(boundary: Boundary, command: Columns, share: float, roll: flo
     )
 
 
-@inner
+@shared
 def settle_needles(
     w: Needles, needle: NeedleState, held: Lateral, live: bool, near: int
 ) -> tuple[NeedleState, int]:

@@ -5,7 +5,7 @@ A needle that begins in the plane z = 0 remains there, to the last bit.
 
 import math
 
-from flexneedle.mechanics.compile import inner, kernel
+from flexneedle.mechanics.compile import inner, kernel, shared
 from flexneedle.phantom.loads import (
     Before,
     add_bevel,
@@ -49,7 +49,7 @@ _SOFTER = 5  # powers of ten: first softening of the guide after a failed solve
 _ROLL_RAD = 0.5
 
 
-@inner
+@shared
 def assemble(
     rod: Rod,
     s: State,
