@@ -70,7 +70,7 @@ class _InnerDispatcher(CPUDispatcher):
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that only kernels call and that allocates no array, into each of its callers.
+    """Compile a function that only kernels call, into each of its callers; it allocates and returns no array.
 
     In a call, lanes would pass through memory, which would take a third of a step.
     """

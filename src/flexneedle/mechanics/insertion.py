@@ -3,6 +3,8 @@
 import math
 
 from flexneedle.mechanics.compile import inner, shared
+from flexneedle.mechanics.contact import contact_rest
+from flexneedle.mechanics.iteration import count_before
 from flexneedle.mechanics.lanes import least, load, most, select, some, store, whole
 from flexneedle.mechanics.lateral import Lateral, lateral, rotate, times
 from flexneedle.mechanics.needle import Boundary, Cut, CutChannel, Equilibrium, NeedleState, NodePose
@@ -58,20 +60,15 @@ def settle_needles(
 @inner
 def _lay_cut(w: Needles, cut: Cut, solution: Solution, live: bool, near: int) -> None:
     """Set the rest positions of the contacts on the path of the tip, eq. 9."""
-    begun, path, y = cut.tip, solution.path, solution.found.tip.y
-    per_length = 1.0 / (solution.solved_x - begun.x)
-    path_y = times(1.0 - path.coupling, path.y)
-    top, total = near, w.mesh.shape[0]
-    while top < total and some(load(w.mesh, top, X) < solution.solved_x):
-        top += 1
-    for i in range(top - 1, -1, -1):
+    solved_x, y = solution.solved_x, solution.found.tip.y
+    for i in range(count_before(w, solved_x, near) - 1, -1, -1):
         x = load(w.mesh, i, X)
         if not some(x > cut.channel.front):
             break
-        share = (x - begun.x) * per_length
-        rest = begun.y + times(share, path_y - begun.y) + times(share * path.coupling, y)
-        fresh = live & (x > cut.channel.front) & (x < solution.solved_x) & (load(w.mesh, i, KIND) == CONTACT)
-        store(w.laterals, i, REST, select(fresh, rest, load(w.laterals, i, REST)))
+        fixed, share = contact_rest(cut, solution.path, solved_x, x)
+        fresh = live & (x > cut.channel.front) & (x < solved_x) & (load(w.mesh, i, KIND) == CONTACT)
+        rest = select(fresh, fixed + times(share, y), load(w.laterals, i, REST))
+        store(w.laterals, i, REST, rest)
 
 
 @inner

@@ -135,40 +135,14 @@ def apart(needle: NeedleState) -> tuple[tuple[float, ...], tuple[Lateral, ...]]:
     base, begun, tip, last, loads = boundary.base, cut.tip, solution.tip, solution.last, solution.loads
     guide = last.guide
     reals = (
-        base.x,
-        begun.x,
-        cut.channel.front,
-        cut.spin,
-        channel.front,
-        tip.x,
-        last.shortening,
-        guide.give,
-        solution.behind,
-        solution.iterations,
-        solution.residual,
-        solution.converged,
-    )
+        base.x, begun.x, cut.channel.front, cut.spin, channel.front, tip.x, last.shortening, guide.give,
+        solution.behind, solution.iterations, solution.residual, solution.converged,
+    )  # fmt: skip
     laterals = (
-        base.y,
-        base.slope,
-        boundary.guide,
-        boundary.bevel,
-        boundary.load,
-        begun.y,
-        begun.slope,
-        cut.channel.rest,
-        channel.rest,
-        tip.y,
-        tip.slope,
-        last.spring,
-        guide.wall,
-        guide.y,
-        guide.force,
-        loads.tip,
-        loads.reaction,
-        loads.shear,
-        loads.moment,
-    )
+        base.y, base.slope, boundary.guide, boundary.bevel, boundary.load, begun.y, begun.slope,
+        cut.channel.rest, channel.rest, tip.y, tip.slope, last.spring, guide.wall, guide.y, guide.force,
+        loads.tip, loads.reaction, loads.shear, loads.moment,
+    )  # fmt: skip
     return reals, laterals
 
 

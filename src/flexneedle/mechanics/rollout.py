@@ -9,34 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.mechanics.compile import inner, kernel
+from flexneedle.mechanics.contact import contact_energy
 from flexneedle.mechanics.insertion import advance_needles, settle_needles
+from flexneedle.mechanics.iteration import count_before
 from flexneedle.mechanics.lanes import fill, lanes_of, least, load, load_all, most, select, some, spill
-from flexneedle.mechanics.lateral import axes_of, dot, size, square, times, y_of, z_of
-from flexneedle.mechanics.law import stored_energy
+from flexneedle.mechanics.lateral import Lateral, axes_of, dot, size, square, times, y_of, z_of
 from flexneedle.mechanics.needle import LATERALS, REALS, NeedleState, apart, together
 from flexneedle.mechanics.spring import spring_energy
-from flexneedle.mechanics.work import (
-    CELLS,
-    CONSTANTS,
-    CONTACT,
-    GUIDE,
-    HEIGHT,
-    KIND,
-    LAW,
-    LOAD,
-    MOMENT,
-    PER_REACH,
-    REST,
-    SHEAR,
-    SLOPE,
-    STIFFNESS,
-    WEIGHT,
-    Constants,
-    Needles,
-    U,
-    Workspace,
-    X,
-    Y,
+
+from flexneedle.mechanics.work import (  # isort: skip
+    CONSTANTS, CONTACT, GUIDE, HEIGHT, KIND, LOAD, MOMENT, REST, SHEAR, SLOPE, U, WEIGHT, X, Y,
+    Constants, Needles, Workspace,
 )  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -85,52 +68,43 @@ class Outputs(NamedTuple):
 
 
 @inner
-def _gather(
-    space: Workspace, models: Models, starts: Starts, model_of: Whole, state_of: Whole, j: int
-) -> tuple[Constants, NeedleState, int]:
-    """Place the needles j, j + 1, … of a rollout side by side.
-
-    Returns their constants, their start, and the number of nodes before the contacts.
-    """
-    n, axes = models.nodes.shape[1], models.curvature.shape[1]
+def _gather_models(space: Workspace, models: Models, model_of: Whole, j: int) -> tuple[Constants, int]:
+    """Place the constants of the needles j, j + 1, … side by side; return them and the nodes before the contacts."""
+    first = 0
     for k in range(CONSTANTS):
         fill(space.constants, 0, k, models.constants, model_of, j, k)
     fill(space.curvature, 0, 0, models.curvature, model_of, j, 0)
-    first = 0
-    for i in range(n):
+    for i in range(models.nodes.shape[1]):
         for k in range(8):
             fill(space.mesh, i, k, models.nodes, model_of, j, i, k)
-        fill(space.laterals, i, REST, starts.rest, state_of, j, i, 0)
-        fill(space.laterals, i, U, starts.compression, state_of, j, i, 0)
         if some(load(space.mesh, i, KIND) != CONTACT):
             first = i + 1
     for i in range(models.layers.shape[1]):
         for k in range(5):
             fill(space.layers, i, k, models.layers, model_of, j, i, k)
+    return Constants(*(*load_all(space.constants, 0, CONSTANTS), load(space.curvature, 0, 0))), first
+
+
+@inner
+def _gather_starts(space: Workspace, starts: Starts, state_of: Whole, j: int) -> NeedleState:
+    """Place the states of the needles j, j + 1, … side by side, and return what they are besides their contacts."""
+    axes = starts.rest.shape[2]
+    for i in range(starts.rest.shape[1]):
+        fill(space.laterals, i, REST, starts.rest, state_of, j, i, 0)
+        fill(space.laterals, i, U, starts.compression, state_of, j, i, 0)
     for k in range(REALS):
         fill(space.needle_reals, 0, k, starts.needles, state_of, j, k)
     for k in range(LATERALS):
         fill(space.needle_laterals, 0, k, starts.needles, state_of, j, REALS + axes * k)
-    flexibility, length, offset, bevel, part, zone, clearance, tolerance, slide = load_all(
-        space.constants, 0, CONSTANTS
-    )
-    curvature = load(space.curvature, 0, 0)
-    constants = Constants(
-        flexibility, length, offset, bevel, part, zone, clearance, tolerance, slide, curvature
-    )
-    needle = together(load_all(space.needle_reals, 0, REALS), load_all(space.needle_laterals, 0, LATERALS))
-    return constants, needle, first
+    return together(load_all(space.needle_reals, 0, REALS), load_all(space.needle_laterals, 0, LATERALS))
 
 
 @inner
 def _count(w: Needles, needle: NeedleState, near: int) -> int:
     """Return the number of nodes behind the tips, or solved."""
-    count, total = near, w.mesh.shape[0]
-    tip_x, behind = needle.solution.tip.x, needle.solution.behind
-    while count < total and some((load(w.mesh, count, X) < tip_x) | (float(count) < behind)):
+    count, behind = count_before(w, needle.solution.tip.x, near), needle.solution.behind
+    while count < w.mesh.shape[0] and some(float(count) < behind):
         count += 1
-    while count > 0 and not some((load(w.mesh, count - 1, X) < tip_x) | (float(count - 1) < behind)):
-        count -= 1
     return count
 
 
@@ -141,27 +115,12 @@ def _is_solved(w: Needles, needle: NeedleState, i: int) -> bool:
 
 
 @inner
-def _grown(w: Needles, i: int, tip_x: float) -> float:
-    return least(1.0, most(0.0, (tip_x - load(w.mesh, i, X)) * load(w.mesh, i, PER_REACH)))
-
-
-@inner
-def _contact_energy(w: Needles, i: int, tip_x: float) -> float:
-    """Return the energy (mJ) that contact i stores, without its weight."""
-    cells = load(w.mesh, i, CELLS)
-    stored = stored_energy(w.laws, load(w.mesh, i, LAW), size(load(w.laterals, i, U)) * cells)
-    contact = load(w.mesh, i, KIND) == CONTACT
-    scale = load(w.mesh, i, STIFFNESS) * _grown(w, i, tip_x)
-    return select(contact, scale * stored / select(contact, cells * cells, 1.0), 0.0)
-
-
-@inner
 def _strain_energy(w: Needles, needle: NeedleState, count: int) -> float:
     """Return the tissue strain energy Σ w_c W (mJ) of the contacts (paper eq. 12)."""
     tip_x = needle.solution.tip.x
     total = 0.0 * tip_x
     for i in range(count):
-        total += load(w.mesh, i, WEIGHT) * _contact_energy(w, i, tip_x)
+        total += load(w.mesh, i, WEIGHT) * contact_energy(w, i, tip_x)
     return total
 
 
@@ -230,41 +189,48 @@ def _spill_curves(w: Needles, needle: NeedleState, count: int, curves: Floats, j
 
 
 @inner
+def _spill_vector(value: Lateral, numbers: Floats, j: int, k: int, column: int) -> None:
+    """Write y and z of each needle, never −0, to two columns."""
+    spill(y_of(value) + 0.0, numbers, j, k, column)
+    spill(z_of(value) + 0.0, numbers, j, k, column + 1)
+
+
+@inner
+def _spill_loads(w: Needles, needle: NeedleState, out: Floats, j: int, k: int) -> None:
+    """Write the loads of the base on the needle and of the guide."""
+    loads = needle.solution.loads
+    guided = (load(w.mesh, 0, KIND) == GUIDE) & _is_solved(w, needle, 0)
+    _spill_vector(times(-1.0, loads.shear), out, j, k, 0)
+    _spill_vector(times(-1.0, loads.moment), out, j, k, 2)
+    _spill_vector(select(guided, load(w.laterals, 0, LOAD), times(0.0, loads.shear)), out, j, k, 4)
+
+
+@inner
 def _spill_step(
-    w: Needles, space: Workspace, needle: NeedleState, count: int, out: Outputs, j: int, k: int, steps: int
+    w: Needles, space: Workspace, needle: NeedleState, count: int, out: Outputs, j: int, k: int, left: int
 ) -> None:
-    """Write the outputs of step k of `steps`."""
-    tip, loads = needle.solution.tip, needle.solution.loads
+    """Write the outputs of step k, with `left` steps from it to the end; an output may have the last steps alone."""
+    tip = needle.solution.tip
     spill(tip.x + 0.0, out.tips, j, k, 0)
-    spill(y_of(tip.y) + 0.0, out.tips, j, k, 1)
-    spill(z_of(tip.y) + 0.0, out.tips, j, k, 2)
-    spill(y_of(tip.slope) + 0.0, out.tips, j, k, 3)
-    spill(z_of(tip.slope) + 0.0, out.tips, j, k, 4)
+    _spill_vector(tip.y, out.tips, j, k, 1)
+    _spill_vector(tip.slope, out.tips, j, k, 3)
     spill(needle.solution.converged, out.converged, j, k)
-    at = k - steps + out.energy.shape[1]
+    at = out.energy.shape[1] - left
     if at >= 0:
         spill(_strain_energy(w, needle, count) + 0.0, out.energy, j, at)
-    at = k - steps + out.stretch.shape[1]
+    at = out.stretch.shape[1] - left
     if at >= 0:
         spill(_least_stretch(w, needle, count), out.stretch, j, at)
-    at = k - steps + out.deflection.shape[1]
+    at = out.deflection.shape[1] - left
     if at >= 0:
         spill(_mean_square_deflection(w, space, needle, count), out.deflection, j, at)
-    at = k - steps + out.strain.shape[1]
+    at = out.strain.shape[1] - left
     if at >= 0:
         spill(_largest_bend(w, needle, count), out.strain, j, at)
-    at = k - steps + out.loads.shape[1]
+    at = out.loads.shape[1] - left
     if at >= 0:
-        guide = (load(w.mesh, 0, KIND) == GUIDE) & _is_solved(w, needle, 0)
-        force = select(guide, load(w.laterals, 0, LOAD), times(0.0, loads.shear))
-        shear, moment = times(-1.0, loads.shear), times(-1.0, loads.moment)
-        spill(y_of(shear) + 0.0, out.loads, j, at, 0)
-        spill(z_of(shear) + 0.0, out.loads, j, at, 1)
-        spill(y_of(moment) + 0.0, out.loads, j, at, 2)
-        spill(z_of(moment) + 0.0, out.loads, j, at, 3)
-        spill(y_of(force) + 0.0, out.loads, j, at, 4)
-        spill(z_of(force) + 0.0, out.loads, j, at, 5)
-    at = k - steps + out.curves.shape[1]
+        _spill_loads(w, needle, out.loads, j, at)
+    at = out.curves.shape[1] - left
     if at >= 0:
         _spill_curves(w, needle, count, out.curves, j, at)
 
@@ -284,7 +250,7 @@ def _spill_ends(w: Needles, needle: NeedleState, count: int, out: Outputs, j: in
     for i in range(count):
         for k in range(5):
             spill(load(w.laterals, i, Y + k), out.solution, j, i, k, 0)
-        spill(_contact_energy(w, i, needle.solution.tip.x), out.stored, j, i)
+        spill(contact_energy(w, i, needle.solution.tip.x), out.stored, j, i)
     spring = spring_energy(w, needle.cut.channel.front, needle.solution.tip.x, needle.solution.last.spring)
     spill(spring, out.stored, j, w.mesh.shape[0])
 
@@ -310,33 +276,25 @@ def rollout(
     (mm) and slope of the line from which deflections count. held (N, axes): without commands, m = 0, the needles are
     settled, with the tip at this y (mm), or free where it is NaN.
     """
-    lanes, steps = lanes_of(space.constants), commands.shape[1]
-    loads = out.loads.size > 0 or out.strain.size > 0 or out.solution.size > 0
-    shape = out.deflection.size > 0 or out.curves.size > 0 or out.solution.size > 0
-    for j in range(first, last, lanes):
-        constants, needle, before = _gather(space, models, starts, model_of, state_of, j)
-        w = Needles(
-            constants,
-            space.mesh,
-            space.layers,
-            models.laws,
-            space.reals,
-            space.laterals,
-            before,
-            shape,
-            loads,
-        )
-        near = 0 * steps
+    steps = commands.shape[1]
+    ends, curves = out.solution.size > 0, out.curves.size > 0
+    loads = ends or out.loads.size > 0 or out.strain.size > 0
+    shape = ends or curves or out.deflection.size > 0
+    for j in range(first, last, lanes_of(space.constants)):
+        constants, before = _gather_models(space, models, model_of, j)
+        tissue, memory = (space.mesh, space.layers, models.laws), (space.reals, space.laterals)
+        w = Needles(constants, *tissue, *memory, before, shape, loads)
+        needle, near = _gather_starts(space, starts, state_of, j), 0 * steps  # no constant, as in `Spans`
         fill(space.axis, 0, 0, axes, sequence, j, 0, 0)
         fill(space.axis, 0, 1, axes, sequence, j, 1, 0)
         for k in range(steps):
             for column in range(9):
                 fill(space.command, 0, column, commands, sequence, j, k, column)
             needle, near = advance_needles(w, needle, space.command, near)
-            _spill_step(w, space, needle, _count(w, needle, near), out, j, k, steps)
+            _spill_step(w, space, needle, _count(w, needle, near), out, j, k, steps - k)
         if steps == 0:
             fill(space.axis, 0, 0, held, sequence, j, 0)
             live = needle.solution.tip.x == needle.solution.tip.x
             needle, near = settle_needles(w, needle, load(space.axis, 0, 0), live, near)
-        if out.solution.size > 0:
+        if ends:
             _spill_ends(w, needle, _count(w, needle, near), out, j)

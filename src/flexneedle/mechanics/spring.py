@@ -2,7 +2,7 @@
 
 import math
 
-from flexneedle.mechanics.compile import inner
+from flexneedle.mechanics.compile import inner, shared
 from flexneedle.mechanics.lanes import least, load, most, select, some
 from flexneedle.mechanics.lateral import Lateral, rotate, shrink, size, steady, times
 from flexneedle.mechanics.law import response, stored_energy
@@ -10,7 +10,7 @@ from flexneedle.mechanics.needle import Cut, Path
 from flexneedle.mechanics.work import END, LAYER_CELLS, LAYER_HEIGHT, LAYER_LAW, LAYER_STIFFNESS, Needles
 
 
-@inner
+@shared
 def spring_rest(w: Needles, bevel: Lateral, cut: Cut, path: Path, tip_x: float) -> tuple[Lateral, float]:
     """Return (fixed, slope): the tip spring rests at fixed + (1 − slope) y_tip; docs/theory.md eq. 8."""
     front, tip = cut.channel.front, cut.tip
@@ -41,7 +41,7 @@ def spring_rest(w: Needles, bevel: Lateral, cut: Cut, path: Path, tip_x: float) 
     return select(cutting, fixed, cut.channel.rest), select(cutting, slope, 1.0)
 
 
-@inner
+@shared
 def spring_law(w: Needles, front: float, tip_x: float, u: Lateral) -> tuple[float, ...]:
     """Return secant and tangent stiffness (N/mm), sharpness (1/mm) and left compression (mm) of the tip spring.
 
