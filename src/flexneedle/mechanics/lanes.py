@@ -12,6 +12,8 @@ are written once; the types of their arrays decide whether they are compiled for
 
 import operator
 from collections.abc import Callable
+from functools import partial
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,62 +35,50 @@ WIDTH = 8
 
 _DOUBLE, _INT, _BYTE = ir.DoubleType(), ir.IntType(64), ir.IntType(8)
 _VECTOR, _BITS = ir.VectorType(_DOUBLE, WIDTH), ir.VectorType(ir.IntType(1), WIDTH)
+_lane = partial(ir.Constant, ir.IntType(32))
+_order = partial(ir.Constant, ir.VectorType(ir.IntType(32), WIDTH))
+_index = partial(ir.Constant, _INT)
 _SIZE = 8  # bytes of a number
 ROW = 8
 """Numbers in a row that `row_of` reads."""
 
 
-class Lanes(types.Type):
-    """A number in each lane; a plain number becomes one that is the same in all of them."""
+class _InLanes(types.Type):
+    """Something in each lane; a plain one becomes one that is the same in all of them."""
+
+    plain: tuple[Any, ...] = ()
 
     def __init__(self) -> None:
-        super().__init__("Lanes")
+        super().__init__(type(self).__name__)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """Return how numbers convert."""
-        return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
+        """Return how a plain type converts."""
+        return Conversion.safe if isinstance(other, self.plain) else None
 
 
-class Mask(types.Type):
+class Lanes(_InLanes):
+    """A number in each lane."""
+
+    plain = types.Float, types.Integer
+
+
+class Mask(_InLanes):
     """A truth value in each lane."""
 
-    def __init__(self) -> None:
-        super().__init__("Mask")
-
-    def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """Return how a truth value converts."""
-        return Conversion.safe if isinstance(other, types.Boolean) else None
+    plain = (types.Boolean,)
 
 
-class Pair(types.Type):
+class Pair(_InLanes):
     """A vector y + iz in each lane."""
-
-    def __init__(self) -> None:
-        super().__init__("Pair")
 
 
 _LANES, _MASK, _PAIR = Lanes(), Mask(), Pair()
 _COMPLEX = types.complex128
 
 
-@register_default(Lanes)
-class _LanesModel(PrimitiveModel):
-    def __init__(self, manager: Any, lanes: Any) -> None:
-        super().__init__(manager, lanes, _VECTOR)
-
-
-@register_default(Mask)
-class _MaskModel(PrimitiveModel):
-    def __init__(self, manager: Any, mask: Any) -> None:
-        super().__init__(manager, mask, _BITS)
-
-
-@register_default(Pair)
-class _PairModel(StructModel):
-    def __init__(self, manager: Any, pair: Any) -> None:
-        super().__init__(manager, pair, [("real", _LANES), ("imag", _LANES)])
-
-
+register_default(Lanes)(lambda manager, kind: PrimitiveModel(manager, kind, _VECTOR))
+register_default(Mask)(lambda manager, kind: PrimitiveModel(manager, kind, _BITS))
+register_default(Pair)(lambda manager, kind: StructModel(manager, kind, [("real", _LANES), ("imag", _LANES)]))
 make_attribute_wrapper(Pair, "real", "real")
 make_attribute_wrapper(Pair, "imag", "imag")
 
@@ -98,15 +88,47 @@ def is_space(kind: Any) -> bool:
     return isinstance(kind, types.Complex | Pair)
 
 
-# ---- conversions
+# ---- parts of values: a pair, of numbers or lanes, has two; anything else is its own part
+
+
+def _split(builder: Any, value: Any) -> list[Any]:
+    """Return the parts of a value."""
+    if not isinstance(value.type, ir.Aggregate):
+        return [value]
+    return [builder.extract_value(value, k) for k in range(len(value.type.elements))]
+
+
+def _join(builder: Any, parts: list[Any]) -> Any:
+    """Return the value with these parts."""
+    if len(parts) == 1:
+        return parts[0]
+    value = ir.Constant(ir.LiteralStructType([part.type for part in parts]), ir.Undefined)
+    for k, part in enumerate(parts):
+        value = builder.insert_value(value, part, k)
+    return value
+
+
+def _numbers(builder: Any, part: Any) -> list[Any]:
+    """Return the numbers in the lanes of a part."""
+    if part.type != _VECTOR:
+        return [part]
+    return [builder.extract_element(part, _lane(k)) for k in range(WIDTH)]
+
+
+def _side_by_side(builder: Any, numbers: list[Any]) -> Any:
+    """Return the part with these numbers in its lanes."""
+    if len(numbers) == 1:
+        return numbers[0]
+    part = ir.Constant(_VECTOR, ir.Undefined)
+    for k, number in enumerate(numbers):
+        part = builder.insert_element(part, number, _lane(k))
+    return part
 
 
 def _in_all(builder: Any, value: Any, vector: Any) -> Any:
     undefined = ir.Constant(vector, ir.Undefined)
-    one = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(
-        one, undefined, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
-    )
+    one = builder.insert_element(undefined, value, _lane(0))
+    return builder.shuffle_vector(one, undefined, _order([0] * WIDTH))
 
 
 @lower_cast(types.Float, Lanes)
@@ -123,90 +145,70 @@ def _truth_to_mask(_context: Any, builder: Any, _given: Any, _wanted: Any, value
 # ---- operators
 
 
-def _operator(
-    function: Any, accepts: Callable[..., bool], given: Any, result: Any, build: Callable[..., Any]
-) -> None:
-    """Define an operator on lanes: arguments that it `accepts` are converted to the type `given`."""
+def _operator(function: Any, given: _InLanes, result: _InLanes, build: Callable[..., Any]) -> None:
+    """Define an operator on lanes: arguments are of the type `given`, at least one of them before conversion."""
+    kind = type(given)
 
     @infer_global(function)
     class _Typing(AbstractTemplate):
         def generic(self, args: Any, _kws: Any) -> Any:
-            return signature(result, *(given for _ in args)) if accepts(*args) else None
+            fits = all(isinstance(a, (kind, *kind.plain)) for a in args)
+            return signature(result, *[given] * len(args)) if fits and given in args else None
 
     def lower(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         return build(builder, *args)
 
-    lower_builtin(function, *[given] * (1 if function in (operator.neg, operator.invert) else 2))(lower)
+    lower_builtin(function, *[given] * (1 if function is operator.neg else 2))(lower)
 
 
-def _some(kind: Any, also: Any) -> Callable[..., bool]:
-    return lambda *args: (
-        any(isinstance(a, kind) for a in args) and all(isinstance(a, (kind, *also)) for a in args)
-    )
-
-
-_real, _truth = _some(Lanes, (types.Float, types.Integer)), _some(Mask, (types.Boolean,))
-for _functions, _name in (
-    ((operator.add, operator.iadd), "fadd"),
-    ((operator.sub, operator.isub), "fsub"),
-    ((operator.mul, operator.imul), "fmul"),
-    ((operator.truediv, operator.itruediv), "fdiv"),
-):
-    for _function in _functions:
-        _operator(_function, _real, _LANES, _LANES, lambda b, x, y, n=_name: getattr(b, n)(x, y))
-for _function, _name in (
-    (operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "=="),
-):  # fmt: skip
-    _operator(_function, _real, _LANES, _MASK, lambda b, x, y, n=_name: b.fcmp_ordered(n, x, y))
-_operator(operator.ne, _real, _LANES, _MASK, lambda b, x, y: b.fcmp_unordered("!=", x, y))
-_operator(operator.neg, _real, _LANES, _LANES, lambda b, x: b.fneg(x))
-_operator(operator.and_, _truth, _MASK, _MASK, lambda b, x, y: b.and_(x, y))
-_operator(operator.or_, _truth, _MASK, _MASK, lambda b, x, y: b.or_(x, y))
-
-
-def _both_parts(name: str) -> Callable[..., Any]:
+def _by_parts(name: str) -> Callable[..., Any]:
     def build(builder: Any, x: Any, y: Any) -> Any:
-        for part in range(2):
-            parts = builder.extract_value(x, part), builder.extract_value(y, part)
-            x = builder.insert_value(x, getattr(builder, name)(*parts), part)
-        return x
+        pairs = zip(_split(builder, x), _split(builder, y), strict=True)
+        return _join(builder, [getattr(builder, name)(*both) for both in pairs])
 
     return build
 
 
-for _functions, _name in (
-    ((operator.add, operator.iadd), "fadd"),
-    ((operator.sub, operator.isub), "fsub"),
+for _name, _kinds, _functions in (
+    ("fadd", (_LANES, _PAIR), (operator.add, operator.iadd)),
+    ("fsub", (_LANES, _PAIR), (operator.sub, operator.isub)),
+    ("fmul", (_LANES,), (operator.mul, operator.imul)),
+    ("fdiv", (_LANES,), (operator.truediv, operator.itruediv)),
 ):
-    for _function in _functions:
-        _operator(_function, _some(Pair, ()), _PAIR, _PAIR, _both_parts(_name))
+    for _function, _kind in product(_functions, _kinds):
+        _operator(_function, _kind, _kind, _by_parts(_name))
+for _function, _name in (
+    (operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "=="),
+):  # fmt: skip
+    _operator(_function, _LANES, _MASK, lambda b, x, y, n=_name: b.fcmp_ordered(n, x, y))
+_operator(operator.ne, _LANES, _MASK, lambda b, x, y: b.fcmp_unordered("!=", x, y))
+_operator(operator.neg, _LANES, _LANES, lambda b, x: b.fneg(x))
+_operator(operator.and_, _MASK, _MASK, lambda b, x, y: b.and_(x, y))
+_operator(operator.or_, _MASK, _MASK, lambda b, x, y: b.or_(x, y))
 
 
 # ---- functions
 
 
-def _primitive(typed: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a decorator of a function's lowering: `typed` maps the types of its arguments to the type of its result.
+def _primitive(typed: Callable[..., Any], build: Callable[..., Any]) -> Callable[[_Function], _Function]:
+    """Return a decorator: `typed` maps the types of the arguments to the type of the result, `build` is the lowering.
 
     The decorated function has the name, and the meaning for numbers in the interpreter.
     """
 
-    def define(build: Callable[..., Any]) -> Callable[[_Function], _Function]:
-        def enter(function: _Function) -> _Function:
-            class _Typing(AbstractTemplate):
-                key = function
-                prefer_literal = True
+    def enter(function: _Function) -> _Function:
+        class _Typing(AbstractTemplate):
+            key = function
+            prefer_literal = True
 
-                def generic(self, args: Any, _kws: Any) -> Any:
-                    return signature(typed(*args), *args)
+            def generic(self, args: Any, _kws: Any) -> Any:
+                return signature(typed(*args), *args)
 
-            builtin_registry.register_global(function, types.Function(_Typing))
-            lower_builtin(function, types.VarArg(types.Any))(build)
-            return function
+        builtin_registry.register_global(function, types.Function(_Typing))
+        lower_builtin(function, types.VarArg(types.Any))(build)
+        return function
 
-        return enter
-
-    return define
+    return enter
 
 
 def _common(*kinds: Any) -> Any:
@@ -243,43 +245,42 @@ def _extreme(sign: str) -> Callable[..., Any]:
     return build
 
 
-@_primitive(_common)(_math("sqrt"))
+@_primitive(_common, _math("sqrt"))
 def root(x: float) -> float:
     """Return the square root."""
     return float(np.sqrt(x))
 
 
-@_primitive(_common)(_math("fabs"))
+@_primitive(_common, _math("fabs"))
 def magnitude(x: float) -> float:
     """Return |x|."""
     return abs(x)
 
 
-@_primitive(_common)(_math("floor"))
+@_primitive(_common, _math("floor"))
 def whole(x: float) -> float:
     """Return the largest whole number that is not above x."""
     return float(np.floor(x))
 
 
-@_primitive(_common)(_extreme("<"))
+@_primitive(_common, _extreme("<"))
 def least(a: float, b: float) -> float:
     """Return the smaller number; `a` where either is NaN."""
     return b if b < a else a
 
 
-@_primitive(_common)(_extreme(">"))
+@_primitive(_common, _extreme(">"))
 def most(a: float, b: float) -> float:
     """Return the larger number; `a` where either is NaN."""
     return b if b > a else a
 
 
 def _select(builder: Any, mask: Any, a: Any, b: Any) -> Any:
-    if isinstance(a.type, ir.Aggregate):
-        for k in range(len(a.type.elements)):
-            part = _select(builder, mask, builder.extract_value(a, k), builder.extract_value(b, k))
-            a = builder.insert_value(a, part, k)
-        return a
-    return builder.select(mask, a, b)
+    if not isinstance(a.type, ir.Aggregate):
+        return builder.select(mask, a, b)
+    for k, parts in enumerate(zip(_split(builder, a), _split(builder, b), strict=True)):
+        a = builder.insert_value(a, _select(builder, mask, *parts), k)
+    return a
 
 
 def _build_select(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -295,7 +296,7 @@ def _type_of_select(mask: Any, a: Any, b: Any) -> Any:
     return _MASK if isinstance(a, Mask) or isinstance(b, Mask) else types.unliteral(a)
 
 
-@_primitive(_type_of_select)(_build_select)
+@_primitive(_type_of_select, _build_select)
 def select(mask: bool, a: _Value, b: _Value) -> _Value:
     """Return `a` where the mask is true, else `b`: numbers, masks, laterals, or records of them."""
     return a if mask else b
@@ -308,7 +309,7 @@ def _build_any(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-@_primitive(lambda _mask: types.boolean)(_build_any)
+@_primitive(lambda _mask: types.boolean, _build_any)
 def some(mask: bool) -> bool:
     """Return whether the mask is true in any lane."""
     return mask
@@ -318,22 +319,18 @@ def _build_not(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
     return builder.not_(args[0])
 
 
-@_primitive(lambda mask: mask)(_build_not)
+@_primitive(lambda mask: mask, _build_not)
 def opposite(mask: bool) -> bool:
     """Return the mask that is true where the given one is false."""
     return not mask
 
 
 def _build_pair(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    lanes = sig.return_type == _PAIR
-    part = _LANES if lanes else types.float64
-    out = ir.Constant(ir.LiteralStructType([_VECTOR if lanes else _DOUBLE] * 2), ir.Undefined)
-    for k, (value, kind) in enumerate(zip(args, sig.args, strict=True)):
-        out = builder.insert_value(out, context.cast(builder, value, kind, part), k)
-    return out
+    part = _LANES if sig.return_type == _PAIR else types.float64
+    return _join(builder, [context.cast(builder, *one, part) for one in zip(args, sig.args, strict=True)])
 
 
-@_primitive(lambda *parts: _PAIR if isinstance(_common(*parts), Lanes) else _COMPLEX)(_build_pair)
+@_primitive(lambda *parts: _PAIR if isinstance(_common(*parts), Lanes) else _COMPLEX, _build_pair)
 def pair(y: float, z: float) -> complex:
     """Return y + iz."""
     return complex(y, z)
@@ -344,18 +341,13 @@ def in_each(function: Any) -> Any:
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         one = context.get_function(function, signature(types.float64, types.float64))
-        if sig.args[0] != _LANES:
-            return one(builder, [context.cast(builder, args[0], sig.args[0], types.float64)])
-        out = ir.Constant(_VECTOR, ir.Undefined)
-        for k in range(WIDTH):
-            at = ir.Constant(ir.IntType(32), k)
-            out = builder.insert_element(out, one(builder, [builder.extract_element(args[0], at)]), at)
-        return out
+        (value,) = _cast_all(context, builder, sig, args)
+        return _side_by_side(builder, [one(builder, [number]) for number in _numbers(builder, value)])
 
     def lanes(x: float) -> float:
         return function(x)
 
-    return _primitive(_common)(build)(lanes)
+    return _primitive(_common, build)(lanes)
 
 
 # ---- arrays
@@ -368,36 +360,34 @@ def _layout(array: Any) -> tuple[Any, Any, int]:
     return (_PAIR, _VECTOR, 2) if array.ndim == 4 else (_LANES, _VECTOR, 1)
 
 
-def _element(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Return a pointer, in bytes, to the element at row and column of an array whose rows are contiguous."""
-    kind, _, parts = _layout(sig.args[0])
+def _place(builder: Any, data: Any, offset: Any, kind: Any) -> Any:
+    """Return a pointer to a value of this LLVM type, `offset` bytes after the start of the data."""
+    at = builder.gep(builder.bitcast(data, _BYTE.as_pointer()), [offset])
+    return builder.bitcast(at, kind.as_pointer())
+
+
+def _parts(context: Any, builder: Any, sig: Any, args: Any) -> list[Any]:
+    """Return pointers to the parts of the element at row and column of an array whose rows are contiguous."""
+    _, part, count = _layout(sig.args[0])
     array = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0])
-    row, column = (context.cast(builder, args[k], sig.args[k], types.int64) for k in (1, 2))
-    size = parts * _SIZE * (1 if isinstance(kind, types.Number) else WIDTH)
-    stride = cgutils.unpack_tuple(builder, array.strides, sig.args[0].ndim)[0]
-    at = builder.add(builder.mul(row, stride), builder.mul(column, ir.Constant(_INT, size)))
-    return builder.gep(builder.bitcast(array.data, _BYTE.as_pointer()), [at])
-
-
-def _part(builder: Any, element: Any, part: Any, k: int) -> Any:
+    row, column = _whole(context, builder, sig, args, 1, 3)
     size = _SIZE * (WIDTH if part == _VECTOR else 1)
-    place = builder.gep(element, [ir.Constant(_INT, k * size)])
-    return builder.bitcast(place, part.as_pointer())
+    stride = cgutils.unpack_tuple(builder, array.strides, sig.args[0].ndim)[0]
+    at = builder.add(builder.mul(row, stride), builder.mul(column, _index(count * size)))
+    return [_place(builder, array.data, builder.add(at, _index(k * size)), part) for k in range(count)]
+
+
+def _whole(context: Any, builder: Any, sig: Any, args: Any, first: int, last: int | None = None) -> list[Any]:
+    """Return arguments from `first` to `last` − 1 as whole numbers."""
+    given = zip(args[first:last], sig.args[first:last], strict=True)
+    return [context.cast(builder, *one, types.int64) for one in given]
 
 
 def _build_load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    _, part, parts = _layout(sig.args[0])
-    element = _element(context, builder, sig, args)
-    values = [builder.load(_part(builder, element, part, k), align=_SIZE) for k in range(parts)]
-    if parts == 1:
-        return values[0]
-    out = ir.Constant(ir.LiteralStructType([part] * parts), ir.Undefined)
-    for k, value in enumerate(values):
-        out = builder.insert_value(out, value, k)
-    return out
+    return _join(builder, [builder.load(place, align=_SIZE) for place in _parts(context, builder, sig, args)])
 
 
-@_primitive(lambda array, _row, _column: _layout(array)[0])(_build_load)
+@_primitive(lambda array, _row, _column: _layout(array)[0], _build_load)
 def load(array: Any, row: int, column: int) -> Any:
     """Return an element."""
     return array[row, column]
@@ -408,41 +398,37 @@ def _type_of_all(array: Any, _row: Any, count: Any) -> Any:
 
 
 def _build_load_all(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    kind, places = sig.return_type.dtype, (types.int64, types.int64)
-    one = signature(kind, sig.args[0], *places)
-    row = context.cast(builder, args[1], sig.args[1], types.int64)
-    columns = [ir.Constant(_INT, k) for k in range(sig.return_type.count)]
-    values = [_build_load(context, builder, one, (args[0], row, column)) for column in columns]
+    one = signature(sig.return_type.dtype, sig.args[0], sig.args[1], types.int64)
+    columns = [_index(k) for k in range(sig.return_type.count)]
+    values = [_build_load(context, builder, one, (*args[:2], column)) for column in columns]
     return context.make_tuple(builder, sig.return_type, values)
 
 
-@_primitive(_type_of_all)(_build_load_all)
+@_primitive(_type_of_all, _build_load_all)
 def load_all(array: Any, row: int, count: int) -> Any:
     """Return the first elements of a row; `count` is a constant."""
     return tuple(array[row, :count].tolist())
 
 
 def _build_lanes_of(_context: Any, _builder: Any, sig: Any, _args: Any) -> Any:
-    return ir.Constant(_INT, 1 if _layout(sig.args[0])[1] == _DOUBLE else WIDTH)
+    return _index(1 if _layout(sig.args[0])[1] == _DOUBLE else WIDTH)
 
 
-@_primitive(lambda _array: types.int64)(_build_lanes_of)
+@_primitive(lambda _array: types.int64, _build_lanes_of)
 def lanes_of(_array: Any) -> int:
     """Return the number of needles in an array."""
     return 1
 
 
 def _build_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    kind, part, parts = _layout(sig.args[0])
-    element = _element(context, builder, sig, args)
-    value = context.cast(builder, args[3], sig.args[3], kind)
-    for k in range(parts):
-        one = value if parts == 1 else builder.extract_value(value, k)
-        builder.store(one, _part(builder, element, part, k), align=_SIZE)
+    value = context.cast(builder, args[3], sig.args[3], _layout(sig.args[0])[0])
+    places = _parts(context, builder, sig, args)
+    for place, part in zip(places, _split(builder, value), strict=True):
+        builder.store(part, place, align=_SIZE)
     return context.get_dummy_value()
 
 
-@_primitive(lambda *_: types.none)(_build_store)
+@_primitive(lambda *_: types.none, _build_store)
 def store(array: Any, row: int, column: int, value: Any) -> None:
     """Set an element."""
     array[row, column] = value
@@ -451,41 +437,31 @@ def store(array: Any, row: int, column: int, value: Any) -> None:
 def _number(context: Any, builder: Any, kind: Any, array: Any, index: list[Any]) -> Any:
     """Return a pointer to a number of an array (…) of numbers, with any strides."""
     proxy = cgutils.create_struct_proxy(kind)(context, builder, value=array)
-    at = ir.Constant(_INT, 0)
+    at = _index(0)
     for place, stride in zip(index, cgutils.unpack_tuple(builder, proxy.strides, kind.ndim), strict=True):
         at = builder.add(at, builder.mul(place, stride))
-    place = builder.gep(builder.bitcast(proxy.data, _BYTE.as_pointer()), [at])
-    return builder.bitcast(place, _DOUBLE.as_pointer())
-
-
-def _places(context: Any, builder: Any, sig: Any, args: Any, first: int) -> list[Any]:
-    return [context.cast(builder, args[k], sig.args[k], types.int64) for k in range(first, len(args))]
+    return _place(builder, proxy.data, at, _DOUBLE)
 
 
 def _after(builder: Any, place: Any, k: int) -> Any:
-    return builder.add(place, ir.Constant(_INT, k))
+    return builder.add(place, _index(k))
 
 
 def _build_fill(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    _, part, parts = _layout(sig.args[0])
-    element = _element(context, builder, sig, args)
+    places = _parts(context, builder, sig, args)
+    lanes = WIDTH if places[0].type.pointee == _VECTOR else 1
     who = cgutils.create_struct_proxy(sig.args[4])(context, builder, value=args[4])
-    first, *inner = _places(context, builder, sig, args, 5)
-    lanes = WIDTH if part == _VECTOR else 1
+    first, *inner, last = _whole(context, builder, sig, args, 5)
     needles = [builder.load(builder.gep(who.data, [_after(builder, first, lane)])) for lane in range(lanes)]
-    for k in range(parts):
-        value = ir.Constant(part, ir.Undefined)
-        for lane, needle in enumerate(needles):
-            index = [needle, *inner[:-1], _after(builder, inner[-1], k)]
-            one = builder.load(_number(context, builder, sig.args[3], args[3], index))
-            value = (
-                builder.insert_element(value, one, ir.Constant(ir.IntType(32), lane)) if lanes > 1 else one
-            )
-        builder.store(value, _part(builder, element, part, k), align=_SIZE)
+    for k, place in enumerate(places):
+        rest = *inner, _after(builder, last, k)
+        numbers = [_number(context, builder, sig.args[3], args[3], [needle, *rest]) for needle in needles]
+        part = _side_by_side(builder, [builder.load(number) for number in numbers])
+        builder.store(part, place, align=_SIZE)
     return context.get_dummy_value()
 
 
-@_primitive(lambda *_: types.none)(_build_fill)
+@_primitive(lambda *_: types.none, _build_fill)
 def fill(array: Any, row: int, column: int, numbers: Any, who: Any, first: int, *index: int) -> None:
     """Set an element from an array of numbers (needles, …): of the needles who[first], who[first + 1], …, at `index`.
 
@@ -497,22 +473,16 @@ def fill(array: Any, row: int, column: int, numbers: Any, who: Any, first: int, 
 def _build_spill(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     value, kind = args[0], sig.args[0]
     if isinstance(kind, types.Float | types.Integer):
-        value, kind = context.cast(builder, value, kind, types.float64), types.float64
-    first, *inner = _places(context, builder, sig, args, 2)
-    parts = [builder.extract_value(value, k) for k in range(2)] if is_space(kind) else [value]
-    for k, part in enumerate(parts):
-        for lane in range(WIDTH if part.type == _VECTOR else 1):
+        value = context.cast(builder, value, kind, types.float64)
+    first, *inner = _whole(context, builder, sig, args, 2)
+    for k, part in enumerate(_split(builder, value)):
+        for lane, number in enumerate(_numbers(builder, part)):
             index = [_after(builder, first, lane), *inner[:-1], _after(builder, inner[-1], k)]
-            one = (
-                builder.extract_element(part, ir.Constant(ir.IntType(32), lane))
-                if part.type == _VECTOR
-                else part
-            )
-            builder.store(one, _number(context, builder, sig.args[1], args[1], index))
+            builder.store(number, _number(context, builder, sig.args[1], args[1], index))
     return context.get_dummy_value()
 
 
-@_primitive(lambda *_: types.none)(_build_spill)
+@_primitive(lambda *_: types.none, _build_spill)
 def spill(value: Any, numbers: Any, first: int, *index: int) -> None:
     """Write a value to an array of numbers (needles, …), as `fill` reads it."""
     raise NotImplementedError
@@ -521,49 +491,32 @@ def spill(value: Any, numbers: Any, first: int, *index: int) -> None:
 # ---- rows of a table
 
 
-def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+def _transpose(builder: Any, rows: list[Any]) -> list[Any]:
     """Return the columns of a square of numbers, as vectors: in three rounds of exchanges."""
-
-    def exchanged(rows: list[Any], step: int) -> list[Any]:
+    for step in (1, 2, 4):
         low = [(k & ~step) + (WIDTH if k & step else 0) for k in range(WIDTH)]
         high = [(k | step) + (WIDTH if k & step else 0) for k in range(WIDTH)]
-        out = list(rows)
-        kinds = ir.VectorType(ir.IntType(32), WIDTH)
-        for k in range(WIDTH):
-            if not k & step:
-                a, b = rows[k], rows[k | step]
-                out[k] = builder.shuffle_vector(a, b, ir.Constant(kinds, low))
-                out[k | step] = builder.shuffle_vector(a, b, ir.Constant(kinds, high))
-        return out
-
-    for step in (1, 2, 4):
-        rows = exchanged(rows, step)
+        rows = [
+            builder.shuffle_vector(rows[k & ~step], rows[k | step], _order(high if k & step else low))
+            for k in range(WIDTH)
+        ]
     return rows
 
 
 def _build_row(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     table = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0])
-    start = builder.bitcast(table.data, _BYTE.as_pointer())
-
-    def place(number: Any) -> Any:
-        row = builder.fptosi(number, _INT)
-        return builder.gep(start, [builder.mul(row, ir.Constant(_INT, ROW * _SIZE))])
-
-    if sig.args[1] != _LANES:
-        first = builder.bitcast(
-            place(context.cast(builder, args[1], sig.args[1], types.float64)), _DOUBLE.as_pointer()
-        )
-        columns = [builder.load(builder.gep(first, [ir.Constant(_INT, k)])) for k in range(ROW)]
+    row = context.cast(builder, args[1], sig.args[1], _common(sig.args[1]))
+    starts = [builder.mul(builder.fptosi(one, _INT), _index(ROW * _SIZE)) for one in _numbers(builder, row)]
+    if len(starts) == 1:
+        places = [_after(builder, starts[0], k * _SIZE) for k in range(ROW)]
+        columns = [builder.load(_place(builder, table.data, place, _DOUBLE)) for place in places]
     else:
-        numbers = [builder.extract_element(args[1], ir.Constant(ir.IntType(32), k)) for k in range(WIDTH)]
-        rows = [
-            builder.load(builder.bitcast(place(one), _VECTOR.as_pointer()), align=_SIZE) for one in numbers
-        ]
-        columns = _transposed(builder, rows)
+        rows = [builder.load(_place(builder, table.data, at, _VECTOR), align=_SIZE) for at in starts]
+        columns = _transpose(builder, rows)
     return context.make_tuple(builder, sig.return_type, columns)
 
 
-@_primitive(lambda _table, row: types.UniTuple(_common(row), ROW))(_build_row)
+@_primitive(lambda _table, row: types.UniTuple(_common(row), ROW), _build_row)
 def row_of(table: Any, row: float) -> Any:
     """Return the 8 numbers of a row of a table (rows, 8); `row` is a whole number."""
     return tuple(table[int(row)].tolist())
