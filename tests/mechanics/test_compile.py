@@ -119,6 +119,13 @@ def test_python_cannot_call_a_function_of_kernels():
     assert compiling.interpret(twice)(4.0) == compiling.kernel(lambda x: twice(x))(4.0) == 8.0
 
 
+@pytest.mark.usefixtures("cache")
+def test_a_function_of_kernels_is_compiled_once_for_constants_and_variables():
+    after = compiling.inner(lambda x: x + 1)
+    assert compiling.kernel(lambda x: after(0) + after(1) + after(x))(2) == 6
+    assert len(after.signatures) == 1
+
+
 def test_without_compilation_one_line_says_what_to_do():
     command = [sys.executable, "-m", "flexneedle", "plan", "phantom"]
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba as nb
+from numba import types as numba_types
 from numba.core import config as _numba_config
 from numba.core.registry import CPUDispatcher, cpu_target
 
@@ -63,6 +64,10 @@ def _columns() -> list[tuple[str, int]]:
 
 class _InnerDispatcher(CPUDispatcher):
     """A compiled function that has no wrapper for Python: the call of one would end the process."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Compile once for an argument's type, not once more for each constant."""
+        return super().get_call_template([numba_types.unliteral(arg) for arg in args], kws)
 
     def __call__(self, *_args: object, **_named: object) -> None:
         name = self.py_func.__name__

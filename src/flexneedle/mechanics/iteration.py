@@ -20,7 +20,6 @@ from flexneedle.mechanics.work import Needles, X
 class Spans(NamedTuple):
     """Numbers of nodes: those from `first` to `last` − 1 take the short loop; `behind` are behind a tip."""
 
-    begin: int  # 0, no constant: Numba would compile what it is passed to once more
     first: int
     last: int
     behind: int
@@ -62,7 +61,7 @@ def find_spans(w: Needles, front: float, tip_x: float, near: int) -> Spans:
         (load(w.mesh, last - 1, X) > front) | (contact_weight(w, last - 1, tip_x) < 1.0)
     ):
         last -= 1
-    return Spans(0 * behind, first, last, behind)
+    return Spans(first, last, behind)
 
 
 @inner

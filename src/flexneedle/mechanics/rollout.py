@@ -284,7 +284,7 @@ def rollout(
         constants, before = _gather_models(space, models, model_of, j)
         tissue, memory = (space.mesh, space.layers, models.laws), (space.reals, space.laterals)
         w = Needles(constants, *tissue, *memory, before, shape, loads)
-        needle, near = _gather_starts(space, starts, state_of, j), 0 * steps  # no constant, as in `Spans`
+        needle, near = _gather_starts(space, starts, state_of, j), 0
         fill(space.axis, 0, 0, axes, sequence, j, 0, 0)
         fill(space.axis, 0, 1, axes, sequence, j, 1, 0)
         for k in range(steps):

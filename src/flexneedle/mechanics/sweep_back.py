@@ -185,7 +185,7 @@ def sweep_back(w: Needles, it: Iteration, tip: Tip) -> Right:
     right = _pass_nodes(w, it, tip.y, spans.last, spans.behind, right)
     for i in range(spans.last - 1, spans.first - 1, -1):
         right = _pass_contact(w, it, i, right)
-    right = _pass_nodes(w, it, tip.y, spans.begin, spans.first, right)
+    right = _pass_nodes(w, it, tip.y, 0, spans.first, right)
     right = _add_span(right, base.x, base.slope, it.bend, w.constants.flexibility)
     x, slope, shear, moment, fifteenfold, error, fraction = right
     return Right(x, slope, shear, moment, fifteenfold / 15.0, error, fraction)

@@ -211,7 +211,7 @@ def sweep_out(w: Needles, it: Iteration, wall: Lateral) -> tuple[Left, Follow]:
     """Sweep from the base to the tip: fill `w`; return the needle just left of the tip spring."""
     zero, base, spans = 0.0 * it.tip_x, it.boundary.base, it.spans
     left, follow = Left(base.x, base.y, base.slope, zero, zero, zero), Follow(zero, zero)
-    left, follow = _pass_nodes(w, it, wall, spans.begin, spans.first, left, follow)
+    left, follow = _pass_nodes(w, it, wall, 0, spans.first, left, follow)
     for i in range(spans.first, spans.last):
         left = _pass_contact(w, it, i, left)
     left, follow = _pass_nodes(w, it, wall, spans.last, spans.behind, left, follow)
