@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 
 from flexneedle.mechanics import lanes as ln
 from flexneedle.mechanics.compile import inner, kernel
@@ -83,3 +84,9 @@ def test_each_lane_is_plain_python_on_its_number():
     lateral = np.array([found for _, found in expected])
     np.testing.assert_allclose(across[..., 0] + 1j * across[..., 1], lateral, rtol=1e-15, atol=1e-15)
     assert groups == sum(any(NEEDLES[k, 0] > 2.0 for k in group) for group in who.reshape(2, -1))
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_memory_of_lanes_begins_at_lines_of_the_cache(axes):
+    spaces = [workspace(nodes, 3, axes) for nodes in range(1, 80)]
+    assert all(array.ctypes.data % 64 == 0 and array.flags.c_contiguous for one in spaces for array in one)
