@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ Whole = NDArray[np.int64]
 COLUMNS = ("energy", "stretch", "deflection", "loads", "strain", "shapes")
 """Names of the outputs of a rollout besides tips and convergence."""
 _STEPS_WORTH_A_THREAD = 1000
-_CHUNKS_A_THREAD = 16
 _memory = threading.local()  # scratch memory of each thread: to take new memory costs as much as some steps
 
 
@@ -95,8 +95,12 @@ def _share(part: Callable[[int, int], None], size: int, threads: int) -> None:
     if threads <= 1:
         part(0, size)
         return
-    edges = np.unique(np.linspace(0, size // WIDTH, threads * _CHUNKS_A_THREAD + 1).astype(int)) * WIDTH
-    chunks = iter([*zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)])
+    edges = [0]
+    while (
+        left := size - edges[-1]
+    ) > 0:  # few chunks, and small ones at the end, so that all threads end together
+        edges.append(edges[-1] + WIDTH * -(-left // (2 * threads * WIDTH)))
+    chunks = iter([*pairwise(edges)])
 
     def work() -> None:
         for chunk in chunks:

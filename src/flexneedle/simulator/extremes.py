@@ -43,14 +43,17 @@ def _find_extremes(rows: Floats, roll: float, found: Floats) -> None:
         for i in range(rows.shape[1]):
             for c in range(rows.shape[2]):
                 value = rows[k, i, c]
+                if value == 0.0:  # most are
+                    continue
                 size = abs(value)
                 if not size <= found[_SIZE, c]:
                     found[_SIZE, c] = size if size < np.inf else np.inf
                 sums[c] += value
                 found[_LEAST, c] = min(found[_LEAST, c], sums[c])
                 found[_MOST, c] = max(found[_MOST, c], sums[c])
-            for value in (rows[k, i, ROLL], rows[k, i, SPIN]):
-                angle += value
-                found[_ANGLE, 0] = max(found[_ANGLE, 0], abs(angle))
-            halves = rows[k, i, ROLL] / np.pi
-            found[_ANGLE, 1] = max(found[_ANGLE, 1], abs(halves - np.rint(halves)))
+                if c >= ROLL:
+                    angle += value
+                    found[_ANGLE, 0] = max(found[_ANGLE, 0], abs(angle))
+                if c == ROLL:
+                    halves = value / np.pi
+                    found[_ANGLE, 1] = max(found[_ANGLE, 1], abs(halves - np.rint(halves)))
