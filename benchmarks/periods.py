@@ -5,28 +5,62 @@
 One insertion per world and rig with the shipped mismatch; for each period with a decision, the time (ms) to decide and
 to observe, without the plant. A control step of 1 mm at 5 mm/s lasts 200 ms. Planning is not included. In space the
 needle turns to any angle, with a guide in both axes where the world has a guide; each world runs in the plane and in
-space one after the other, and the last line compares the two.
+space one after the other, and the last line compares the two. `kernels` is the time of rollouts within both.
 """
 
 import argparse
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest import mock
 
 import numpy as np
 
 import flexneedle
+from flexneedle.loop.events import PeriodEnded
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.scenario.worlds import PLANE, has_rig, world
+from flexneedle.simulator import batch
 
 FIRST, COUNT = 100_000, 40
 IN_SPACE = ("two-axes", "no-guide")
 
 
 def periods_of(number: int, rig: str, threads: int | None) -> np.ndarray:
-    """Times (n, 2) to decide and to observe (ms) in the periods of a world's insertion with a decision."""
+    """Times (n, 3) to decide, to observe and in kernels (ms) in the periods of a world's insertion with a decision."""
     scenario = world(number, rig=rig)
     plan = flexneedle.plan(scenario, seed=number, threads=threads)
-    insertion = flexneedle.insert(scenario, plan, seed=number, force=True, threads=threads)
-    decided = [period.durations for period in insertion.periods if np.isfinite(period.miss[0])]
-    return 1e3 * np.array([[spent["decide"], spent["observe"]] for spent in decided]).reshape(-1, 2)
+    marks: list[float] = [0.0]  # time in kernels up to the end of each period
+    with time_kernels() as spent:
+        insertion = flexneedle.insert(
+            scenario,
+            plan,
+            seed=number,
+            force=True,
+            threads=threads,
+            listeners=[lambda event: marks.append(sum(spent)) if isinstance(event, PeriodEnded) else None],
+        )
+    found = [
+        (period.durations["decide"], period.durations["observe"], kernels)
+        for period, kernels in zip(insertion.periods, np.diff(marks), strict=True)
+        if np.isfinite(period.miss[0])
+    ]
+    return 1e3 * np.array(found).reshape(-1, 3)
+
+
+@contextmanager
+def time_kernels() -> Iterator[list[float]]:
+    """Yield a list to which the time (s) of each rollout in kernels is appended."""
+    spent: list[float] = []
+
+    def share(*arguments: object) -> None:
+        begun = time.perf_counter()
+        original(*arguments)
+        spent.append(time.perf_counter() - begun)
+
+    original = batch._share
+    with mock.patch.object(batch, "_share", share):
+        yield spent
 
 
 def line(label: str, values: np.ndarray, unit: str = " ms") -> str:
@@ -58,11 +92,11 @@ def main() -> None:
         print(f"{name}: {len(times)} periods, {count} worlds from {first}")
         print(line("decide", times[:, 0]))
         print(line("observe", times[:, 1]))
-        print(line("decide and observe", times.sum(axis=1)))
-    ratios = [
-        there.sum(axis=1).mean() / here.sum(axis=1).mean() for here, there in zip(plane, space, strict=True)
-    ]
-    print(line("space / plane", np.array(ratios), unit=""))
+        print(line("decide and observe", times[:, :2].sum(axis=1)))
+        print(line("kernels", times[:, 2]), f"  share {times[:, 2].sum() / times[:, :2].sum():.2f}")
+    ratios = [there[:, :2].sum() / len(there) for there in space]
+    ratios = np.divide(ratios, [here[:, :2].sum() / len(here) for here in plane])
+    print(line("space / plane", ratios, unit=""))
 
 
 if __name__ == "__main__":
