@@ -17,6 +17,7 @@ import numpy as np
 
 import flexneedle
 from flexneedle import Adaptation, Control, Scenario, Simulator
+from flexneedle.mechanics.solve import COUPLED_ITERATIONS
 from flexneedle.scenario.sections.needle import GAUGES
 from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
@@ -209,9 +210,7 @@ def _repeat_by_step(simulator: Simulator, rows: np.ndarray, roll: float, tally: 
     for row in rows:
         state = simulator.step(state, Control.of(row))
         tally.most_iterations = max(tally.most_iterations, state.iterations)
-        tally.fallback_steps += (
-            state.iterations > 8
-        )  # fallback to the uncoupled equilibrium, theory section 6
+        tally.fallback_steps += state.iterations > COUPLED_ITERATIONS  # theory section 6
         tally.worst_residual_mm = max(tally.worst_residual_mm, state.residual)
         tally.checked_steps += 1
 

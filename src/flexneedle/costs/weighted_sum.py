@@ -49,7 +49,7 @@ class Trajectories:
 
     def __repr__(self) -> str:
         sequences, steps = self.converged.shape
-        share = f"{np.mean(self.converged):.0%} converged"
+        share = f"{self.converged.all(axis=1).sum() / max(1, sequences):.0%} converged"
         return f"<Trajectories of {sequences} sequences of {steps} steps, {share}>"
 
 

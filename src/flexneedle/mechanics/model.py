@@ -140,22 +140,29 @@ class Adaptation(NamedTuple):
     clearance: float = 0.0
 
 
-def check_adaptation(model: Model, adaptation: Adaptation) -> None:
-    """Raise InputError, with the rule, for changes that the model cannot take."""
-    layers = model.layers.size
-    for name, shape in (("shift", (layers - 1,)), ("stiffness", (layers,))):
-        if np.shape(values := getattr(adaptation, name)) != shape:
-            raise make_refusal(name, values, f"must be an array {shape}")
-    for name in ("stiffness", "variation", "cell"):
-        values = np.asarray(getattr(adaptation, name), dtype=float)
-        if not (values.size and (values > 0.0).all() and np.isfinite(values).all()):
-            raise make_refusal(name, values, "must be finite and above 0")
-    for name in ("shift", "bevel", "bend", "clearance"):
-        values = np.asarray(getattr(adaptation, name))
-        if not np.isfinite(values).all() or (name in ("bevel", "clearance") and values < 0.0):
-            raise make_refusal(name, values, "must be finite, bevel and clearance at least 0")
-    if isinstance(adaptation.bend, complex) and not isinstance(model.curvature, complex):
-        raise make_refusal("bend", adaptation.bend, "must be a real number in the plane")
+def check_adaptation(model: Model, adaptation: Adaptation) -> Adaptation:
+    """Return changes with values of floats; InputError, with the rule, for changes that the model cannot take."""
+    layers, space = model.layers.size, isinstance(model.curvature, complex)
+    shapes = {"shift": (layers - 1,), "stiffness": (layers,), "variation": None}
+    checked: dict[str, Any] = {}
+    for name, given in adaptation._asdict().items():
+        shape = shapes.get(name, ())
+        try:
+            values = np.array(given, dtype=complex if name == "bend" and space else float)
+        except (TypeError, ValueError):
+            rule = "must be numbers" if name == "bend" and space else "must be real numbers"
+            raise make_refusal(name, given, rule) from None
+        if values.shape != shape if shape is not None else values.ndim != 1 or not values.size:
+            rule = "must be a number" if shape == () else f"must be an array {shape or '(c,), c at least 1'}"
+            raise make_refusal(name, given, rule)
+        if not np.isfinite(values).all():
+            raise make_refusal(name, given, "must be finite")
+        if name in ("stiffness", "variation", "cell") and not (values > 0.0).all():
+            raise make_refusal(name, given, "must be above 0")
+        if name in ("bevel", "clearance") and values < 0.0:
+            raise make_refusal(name, given, "must be at least 0")
+        checked[name] = values if shape != () else values.item()
+    return Adaptation(**checked)
 
 
 def adapt(model: Model, adaptation: Adaptation) -> Model:

@@ -23,6 +23,7 @@ Whole = NDArray[np.int64]
 COLUMNS = ("energy", "stretch", "deflection", "loads", "strain", "shapes")
 """Names of the outputs of a rollout besides tips and convergence."""
 _STEPS_WORTH_A_THREAD = 1000
+_MOST_THREADS = 256
 _memory = threading.local()  # scratch memory of each thread: to take new memory costs as much as some steps
 
 
@@ -107,10 +108,17 @@ def _share(part: Callable[[int, int], None], size: int, threads: int) -> None:
             part(*chunk)
 
     # This thread works too: where all are woken at once, two may begin on one core.
-    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
-    work()
-    for other in others:
-        other.result()
+    others = [_pool().submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        for _ in chunks:  # after an interrupt nothing is left for the others
+            pass
+        for other in others:
+            if (
+                not other.cancel()
+            ):  # one that has not begun, since other rollouts use the pool, has nothing to do
+                other.result()
 
 
 def sample_shapes(curves: Floats, nodes: int) -> Floats:
@@ -136,8 +144,8 @@ def _workspace(nodes: int, layers: int, axes: int) -> Workspace:
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="rollout")
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_MOST_THREADS, thread_name_prefix="rollout")  # threads start as they are needed
 
 
 os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on in a child

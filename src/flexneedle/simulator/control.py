@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flexneedle.arguments import check_whole, make_refusal
 from flexneedle.errors import CommandError
+from flexneedle.mechanics.extremes import find_extremes
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.types import COLUMNS, DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, ROLL, SPIN, Control, Floats
@@ -17,8 +18,7 @@ MOVES = ROLL
 ROUNDING_S = 1e-7
 """Largest time (s) by which a travel may be shorter than its duration."""
 _SIZES = "give the sizes one by one: controls(4, 30, db_x=1.0)"
-SLACK = 1e-9
-"""Rounding of sums of steps, mm or rad, and of half turns."""
+_SLACK = 1e-9  # rounding of sums of steps, mm or rad, and of half turns
 
 
 def controls(*shape: int, **columns: ArrayLike) -> Floats:
@@ -100,28 +100,48 @@ class Limits:
         self._check_moves(moved, rows)
         self._check_rotation(rows, roll)
 
+    def are_kept(self, moved: Floats, rows: Floats, roll: float) -> bool:
+        """Return whether controls (N, m, 9) break no limit, for certain; arguments as for `check`.
+
+        False leaves it open: `check` decides.
+        """
+        found = np.zeros((4, len(COLUMNS)))
+        find_extremes(rows, roll, found)
+        sizes, least, most, (angle, uneven, *_) = found
+        used = sizes[:MOVES] > 0.0
+        low, high = self.travel.T - moved
+        moves = (
+            np.isfinite(sizes).all()
+            and (sizes[:MOVES] <= self.step).all()
+            and not (used & [bool(reason) for reason in self.fixed]).any()
+            and ((low <= least[:MOVES]) & (most[:MOVES] <= high))[used].all()
+        )
+        if self.half_turns:
+            return bool(moves and uneven <= _SLACK and sizes[SPIN] == 0.0)
+        return bool(moves and angle <= self.rotation)
+
     def _check_moves(self, moved: Floats, rows: Floats) -> None:
         """Raise CommandError for the first value that is not finite, or that moves the base or the guide too far."""
         if not np.isfinite(rows).all():
             self._refuse(rows, ~np.isfinite(rows), "must be a finite number")
         steps = rows[..., :MOVES]
         for column, reason in enumerate(self.fixed):
-            if reason and (moving := np.abs(steps[..., column]) > SLACK).any():
+            if reason and (moving := np.abs(steps[..., column]) > _SLACK).any():
                 value = float(steps[..., column][moving][0])
                 raise CommandError(COLUMNS[column], value, 0.0, f"must be 0 {reason}")
-        if (bad := np.abs(steps) > self.step + SLACK).any():
+        if (bad := np.abs(steps) > self.step + _SLACK).any():
             self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
         before = travel - steps
-        if (bad := travel > np.maximum(self.travel[:, 1], before) + SLACK).any():
+        if (bad := travel > np.maximum(self.travel[:, 1], before) + _SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at most", self.travel[:, 1])
-        if (bad := travel < np.minimum(self.travel[:, 0], before) - SLACK).any():
+        if (bad := travel < np.minimum(self.travel[:, 0], before) - _SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at least", self.travel[:, 0])
 
     def _check_rotation(self, rows: Floats, roll: float) -> None:
         if self.half_turns:
             halves, spin = rows[..., ROLL] / np.pi, rows[..., SPIN]
-            if (bad := np.abs(halves - np.rint(halves)) > SLACK).any():
+            if (bad := np.abs(halves - np.rint(halves)) > _SLACK).any():
                 rule = f"must be half turns with {self.half_turns}"
                 raise CommandError("roll", float(rows[..., ROLL][bad][0]), np.pi, rule)
             if (bad := spin != 0.0).any():
@@ -129,7 +149,7 @@ class Limits:
         elif math.isfinite(self.rotation):
             steps = rows[..., ROLL:].reshape(*rows.shape[:-2], -1)
             angle = roll + np.cumsum(steps, axis=-1)
-            if (bad := np.abs(angle) > np.maximum(self.rotation, np.abs(angle - steps)) + SLACK).any():
+            if (bad := np.abs(angle) > np.maximum(self.rotation, np.abs(angle - steps)) + _SLACK).any():
                 rule = f"angle of the needle must be at most {self.rotation:g} rad to either side"
                 rule += f" (setup.max_rotation_deg = {math.degrees(self.rotation):g})"
                 raise CommandError("roll", float(angle[bad][0]), self.rotation, rule)

@@ -1,6 +1,6 @@
 """Sequences of controls as arrays of kernels, each with its state and its model, and their results."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flexneedle.arguments import check_instance, make_refusal
 from flexneedle.costs.weighted_sum import Trajectories
+from flexneedle.errors import CommandError
 from flexneedle.mechanics.model import Model, pack
 from flexneedle.mechanics.needle import to_parts
 from flexneedle.mechanics.rollout import Models, Outputs, Starts
@@ -26,18 +27,27 @@ _AHEAD_TOLERANCE_MM = 1e-4  # of rollouts without limits
 # ---- arguments
 
 
-def as_rows(controls: ArrayLike) -> Floats:
-    """Return controls (N, m, 9) as a new array; InputError for another shape."""
-    rows = np.array(controls, dtype=float, order="C")  # a copy, for whose layout kernels are compiled
-    if rows.ndim != 3 or rows.shape[2] != len(COLUMNS):
-        rule = f"must be (N, m, {len(COLUMNS)}), sequences of controls with the columns of Control"
-        raise make_refusal("shape of controls", rows.shape, rule)
+def as_rows(controls: ArrayLike, shape: str = "(N, m, 9), sequences of controls", axes: int = 3) -> Floats:
+    """Return controls (N, m, 9), or of other axes, as a new array; InputError, with the `shape`, for another one."""
+    try:
+        rows = np.array(controls, dtype=float, order="C")  # a copy, for whose layout kernels are compiled
+    except (TypeError, ValueError):
+        raise make_refusal("controls", controls, "must be numbers") from None
+    if rows.ndim != axes or rows.shape[-1] != len(COLUMNS):
+        raise make_refusal("shape of controls", rows.shape, f"must be {shape} with the columns of Control")
     return rows
+
+
+def check_finite(rows: Floats) -> None:
+    """Raise CommandError for the first of controls (…, 9) that is not finite."""
+    if not (finite := np.isfinite(rows)).all():
+        index = tuple(np.argwhere(~finite)[0])
+        raise CommandError(COLUMNS[index[-1]], float(rows[index]), np.nan, "must be a finite number")
 
 
 def as_names(outputs: Collection[str]) -> list[str]:
     """Return the names of outputs, which may be a single one; InputError for an unknown one."""
-    names = [outputs] if isinstance(outputs, str) else [*outputs]
+    names = [outputs] if isinstance(outputs, str) or not isinstance(outputs, Collection) else [*outputs]
     for name in names:
         if name not in OUTPUTS:
             raise make_refusal("output", name, f"must be one of {', '.join(OUTPUTS)}")
@@ -46,25 +56,37 @@ def as_names(outputs: Collection[str]) -> list[str]:
 
 def as_states(states: State | Sequence[State], count: int) -> list[State]:
     """Return the states of `count` sequences, or one for all; InputError for another number of them."""
-    begun = [states] if isinstance(states, State) else list(states)
-    if not isinstance(states, State) and len(begun) != count:
-        rule = f"must be {count}, one for each sequence, or one state"
-        raise make_refusal("number of states", len(begun), rule)
+    begun = list(states) if isinstance(states, Iterable) else [states]
     for state in begun:
         check_instance("state", state, State, "begin with simulator.start()")
+        own, first = ((one.scenario.setup.axes, one.scenario.needle.nodes) for one in (state, begun[0]))
+        if own != first:
+            rule = f"must be the same for all states, here {first}"
+            raise make_refusal("setup.axes and needle.nodes", own, rule)
+    if not begun or (isinstance(states, Iterable) and len(begun) != count):
+        rule = f"must be {max(1, count)}, one for each sequence, or one state"
+        raise make_refusal("number of states", len(begun), rule)
     return begun
 
 
-def check_models(models: Sequence[Model], states: Sequence[State], count: int) -> None:
-    """Raise InputError unless there is a model for each of `count` sequences, which fits its state."""
-    if len(models) != count:
-        raise make_refusal("number of models", len(models), f"must be {count}, one for each sequence")
-    for k, model in enumerate(models):
-        check_instance("model", model, Model, "make one with simulator.adapt(adaptation)")
-        points = model.nodes.size, 2 if isinstance(model.curvature, complex) else 1
-        if points != states[k if len(states) > 1 else 0].solved.rest.shape:
-            rule = "must have the axes and contact points of its state's scenario"
-            raise make_refusal(f"model {k}", f"{points[0]} points on {points[1]} axes", rule)
+def check_model(name: str, model: Model, other: Model) -> None:
+    """Raise InputError unless a model has the axes and the contact points of another."""
+    check_instance(name, model, Model, "make one with simulator.adapt(adaptation)")
+    same = type(model.curvature) is type(other.curvature)
+    if not (same and np.array_equal(model.nodes["x"], other.nodes["x"])):
+        axes = 2 if isinstance(model.curvature, complex) else 1
+        rule = "must have the axes, guide and contact points of its state's scenario"
+        raise make_refusal(name, f"{model.nodes.size} points on {axes} axes", rule)
+
+
+def check_models(models: Sequence[Model], states: Sequence[State], count: int) -> list[Model]:
+    """Return the models; InputError unless there is one for each of `count` sequences, which fits its state."""
+    given: list[Model] = [models] if isinstance(models, Model) else list(models)
+    if len(given) != count:
+        raise make_refusal("number of models", len(given), f"must be {count}, one for each sequence")
+    for k, model in enumerate(given):
+        check_model(f"model {k}", model, states[k if len(states) > 1 else 0].model)
+    return given
 
 
 # ---- arrays of kernels
@@ -111,9 +133,12 @@ def lines(states: Sequence[State], count: int, axes: ArrayLike | None = None) ->
     entries = [state.scenario.entry for state in (states[:1] if _common_scenario(states) else states)]
     own = [[entry.lateral(0.0), entry.slope] for entry in entries]
     try:
-        found = np.broadcast_to(np.array(own) if axes is None else np.asarray(axes), (count, 2))
-    except ValueError:
-        raise make_refusal("shape of axes", np.asarray(axes).shape, f"must be ({count}, 2)") from None
+        given = np.array(own if axes is None else axes, dtype=complex)
+        found = np.broadcast_to(given, (count, 2))
+    except (TypeError, ValueError):
+        raise make_refusal("axes", axes, f"must be numbers ({count}, 2)") from None
+    if not np.isfinite(given).all():
+        raise make_refusal("axes", axes, "must be finite")
     return np.ascontiguousarray(to_parts(found, states[0].scenario.setup.axes))
 
 

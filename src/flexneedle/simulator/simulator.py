@@ -24,11 +24,12 @@ from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.batch import count_cores, run
 from flexneedle.simulator.build import build_model
 from flexneedle.simulator.control import MOVES, Limits, controls
-from flexneedle.simulator.extremes import are_within
 from flexneedle.simulator.sequences import (
     as_names,
     as_rows,
     as_states,
+    check_finite,
+    check_model,
     check_models,
     drive,
     end,
@@ -75,7 +76,7 @@ class Simulator:
     ) -> None:
         self.scenario = load_scenario(scenario)
         self.threads = count_cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
-        self._model = constants or build_model(self.scenario)
+        self._model = constants or self._nominal
         self._limits = Limits.of(self.scenario)
 
     def __repr__(self) -> str:
@@ -118,7 +119,9 @@ class Simulator:
         Returns the state at the end and the tips (m, 5).
         """
         self._check_mechanics(state)
-        return self._carry_out(state, np.array(controls, dtype=float, order="C"))
+        rows = as_rows(controls, "(m, 9), a sequence of controls", 2)
+        check_finite(rows)
+        return self._carry_out(state, rows)
 
     def _carry_out(self, state: State, rows: Floats) -> tuple[State, Floats]:
         none, starts = np.zeros(1, dtype=np.int64), pack_states([state], self._model.nodes.size)
@@ -133,13 +136,17 @@ class Simulator:
         return self._model
 
     def adapt(self, adaptation: Adaptation) -> Model:
-        """Return the constants with changes, for `rollout`; InputError for a change that cannot be made."""
+        """Return the scenario's constants with changes, for `rollout` or `with_model`.
+
+        The changes are relative to the scenario, also if this simulator has another model. Layers are in the order of
+        the scenario's tissue. InputError for a change that cannot be made.
+        """
         check_instance("adaptation", adaptation, Adaptation, "make one with flexneedle.Adaptation")
-        check_adaptation(self._model, adaptation)
-        return adapt(self._model, adaptation)
+        return adapt(self._nominal, check_adaptation(self._nominal, adaptation))
 
     def with_model(self, constants: Model) -> "Simulator":
-        """Return this simulator with other constants, for states of the same scenario."""
+        """Return this simulator with other constants; InputError if they do not fit states of the scenario."""
+        check_model("model", constants, self._model)
         other = copy(self)
         other._model = constants
         vars(other).pop("_packed", None)
@@ -163,15 +170,18 @@ class Simulator:
         rough: bool = False,
         axes: ArrayLike | None = None,
     ) -> Trajectories:
-        """Run each of N sequences of controls (N, m, 9) from its state. Bit-identical to repeated `step`.
+        """Run each of N sequences of controls (N, m, 9) from its state.
+
+        Unless `rough`, the results are the same as of repeated `step` with the same model, to the last bit. Before
+        further steps from states at the end, give the same `models` again.
 
         Args:
             states: The state before the first step, one for all sequences or N.
             controls: Columns of `Control`.
             models: The constants of each sequence, N of them (default: this simulator's, for all): from
                 `simulator.adapt(adaptation)`, or `simulator.model` of another scenario for states of that scenario.
-            outputs: Names of the outputs of each step: energy, stretch, deflection, loads, strain, shapes. What is not
-                asked for is not computed.
+            outputs: Names, or one name, of the outputs of each step: energy, stretch, deflection, loads, strain,
+                shapes. What is not asked for is not computed.
             at_end: Names of the outputs of the last step alone.
             ends: Whether the result has the states at the end.
             limits: Whether limits of commands apply; without them a step may be longer.
@@ -189,9 +199,11 @@ class Simulator:
             for state in begun:
                 self._check_mechanics(state)
         else:
-            check_models(models, begun, len(rows))
+            models = check_models(models, begun, len(rows)) or None
         if limits:
             self._check_limits(begun, rows)
+        else:
+            check_finite(rows)
         each, shared = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64)
         packed, model_of = (self._packed, shared) if models is None else pack_distinct(models)
         out = run(
@@ -212,7 +224,7 @@ class Simulator:
         for k, state in enumerate(begun):
             limits = self._limits if state.scenario is self.scenario else Limits.of(state.scenario)
             few, travel = rows[k : k + 1] if len(begun) > 1 else rows, state.travel
-            if not are_within(limits, travel, few, state.roll):
+            if not limits.are_kept(travel, few, state.roll):
                 limits.check(travel, few, state.roll)
 
     def assimilate(
@@ -266,6 +278,9 @@ class Simulator:
     def _check_points(self, state: State, x: Floats) -> None:
         guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
         low, high = float(state.base[0]), float(state.tip[0])
+        if guide and self._model.clearance > 0.0 and (behind := x[x < guide[0]]).size:
+            rule = f"must be past the guide ({guide[0]:g} mm), in which the needle has clearance"
+            raise CommandError("measured point x", float(behind[0]), guide[0], rule)
         fixed = np.array([low, *guide, high])
         for k, value in enumerate(x):
             others = np.append(fixed, np.delete(x, k))
@@ -283,13 +298,17 @@ class Simulator:
         tip = None if held is None else nd.to_parts(np.array([held]), axes)
         rows, starts = np.zeros((1, 0, len(COLUMNS))), pack_states([state], merged.nodes.size)
         out = run(packed, none, starts, none, rows, lines([state], 1), 1, ends=True, held=tip)
-        return replace(state, solved=Solved.of(merged, out, 0))
+        return replace(state, model=self._model, solved=Solved.of(merged, out, 0))
 
     def _check_mechanics(self, state: State) -> None:
         if state.scenario is self.scenario:
             return
         if (found := state.scenario.first_difference(self.scenario, _MECHANICS)) is not None:
             raise StateError(f"state of another scenario: {found.key} was {found.old}, is {found.new}")
+
+    @cached_property
+    def _nominal(self) -> Model:
+        return build_model(self.scenario)
 
     @cached_property
     def _packed(self) -> Models:

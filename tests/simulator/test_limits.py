@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from flexneedle import load_scenario
 from flexneedle.errors import CommandError
 from flexneedle.simulator.control import Limits, controls
-from flexneedle.simulator.extremes import are_within
 from flexneedle.types import COLUMNS, DB_X, ROLL
 
 SCENARIOS = {
@@ -39,14 +38,14 @@ def test_sequences_within_by_their_extremes_break_no_limit(name, place, value, l
     rows[1, 2, DB_X], rows[0, 0, ROLL] = length, np.pi
     rows[place] = value
     roll = -np.pi if name == "range" else 0.0
-    assert not (are_within(limits, MOVED, rows, roll) and is_refused(limits, rows, roll))
+    assert not (limits.are_kept(MOVED, rows, roll) and is_refused(limits, rows, roll))
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_usual_sequences_are_within(name):
     limits, rows = Limits.of(SCENARIOS[name]), controls(3, 40, db_x=1.0, dg_y=0.02)
     rows[1, 7, ROLL], rows[2, 9, ROLL] = np.pi, -np.pi
-    assert are_within(limits, MOVED, rows, 0.0)
+    assert limits.are_kept(MOVED, rows, 0.0)
     assert not is_refused(limits, rows, 0.0)
 
 
@@ -72,4 +71,4 @@ def test_a_value_that_breaks_a_limit_is_found(name, start, columns):
     rows = controls(2, steps)
     rows[1] = controls(steps, **columns)
     assert is_refused(limits, rows, start)
-    assert not are_within(limits, MOVED, rows, start)
+    assert not limits.are_kept(MOVED, rows, start)
