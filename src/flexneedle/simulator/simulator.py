@@ -200,10 +200,7 @@ class Simulator:
                 self._check_mechanics(state)
         else:
             models = check_models(models, begun, len(rows)) or None
-        if limits:
-            self._check_limits(begun, rows)
-        else:
-            check_finite(rows)
+        self._check_commands(begun, rows, limits)
         each, shared = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64)
         packed, model_of = (self._packed, shared) if models is None else pack_distinct(models)
         out = run(
@@ -220,12 +217,15 @@ class Simulator:
         )
         return trajectories(rows, out, begun, (models or [self._model] * len(rows)) if ends else None)
 
-    def _check_limits(self, begun: Sequence[State], rows: Floats) -> None:
+    def _check_commands(self, begun: Sequence[State], rows: Floats, limits: bool) -> None:
+        if not limits:
+            check_finite(rows)
+            return
         for k, state in enumerate(begun):
-            limits = self._limits if state.scenario is self.scenario else Limits.of(state.scenario)
+            own = self._limits if state.scenario is self.scenario else Limits.of(state.scenario)
             few, travel = rows[k : k + 1] if len(begun) > 1 else rows, state.travel
-            if not limits.are_kept(travel, few, state.roll):
-                limits.check(travel, few, state.roll)
+            if not own.are_kept(travel, few, state.roll):
+                own.check(travel, few, state.roll)
 
     def assimilate(
         self, state: State, tip: Sequence[float], points: Sequence[Sequence[float]] = ()

@@ -225,8 +225,8 @@ class State:
 
     def discount_advance(self, extra: float) -> "State":
         """Return the state with this part (mm) of the base's advance counted as an error, which is no travel."""
-        clamp, aside = self.clamp, self.scenario.entry.slope * extra
-        across = lateral(clamp.y, clamp.y.real + aside.real, clamp.y.imag + aside.imag)
+        clamp, offset = self.clamp, self.scenario.entry.slope * extra
+        across = lateral(clamp.y, clamp.y.real + offset.real, clamp.y.imag + offset.imag)
         return replace(self, clamp=nd.NodePose(clamp.x + extra, across, clamp.slope))
 
     def _curve(self) -> tuple[Floats, Laterals, Laterals]:
