@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 
 from flexneedle.arguments import make_refusal
+from flexneedle.invasiveness import Invasiveness
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import (
+    DG_Y,
+    DG_Z,
     PSI,
     ROLL,
     THETA,
@@ -60,6 +63,7 @@ class Plan:
         converged: Whether the search converged.
         history: One dict per iteration of the planner.
         limit: Limit that binds if the target is out of reach, else "".
+        least_stretch: Least stretch λ of the tissue (m + 1,); NaN (1,): unknown.
         seconds: Wall-clock time (s) of the search.
         scenario: Scenario of the plan, None if unknown.
         versions: Versions that made a loaded plan, by package; empty for a new one.
@@ -80,6 +84,7 @@ class Plan:
     converged: bool
     history: tuple[dict[str, Any], ...]
     limit: str  # which limit binds if the target is out of reach, else ""
+    least_stretch: Floats = field(default_factory=lambda: np.full(1, math.nan))
     seconds: float = field(default=0.0, compare=False)  # wall clock
     scenario: Scenario | None = None
     versions: Mapping[str, str] = field(default_factory=dict, compare=False)
@@ -98,6 +103,18 @@ class Plan:
     def strain_energy_mj(self) -> float:
         """Weighted tissue energy at the end."""
         return float(self.strain_energy[-1])
+
+    @property
+    def invasiveness(self) -> Invasiveness:
+        """Load on the tissue over the whole plan."""
+        return Invasiveness.measure(
+            self.tips[:, X],
+            self.strain_energy,
+            scale=_energy_scale(self.scenario, self.target),
+            stretch=self.least_stretch,
+            guide_steps=self.controls[:, DG_Y : DG_Z + 1],
+            rolls=self.flips,
+        )
 
     @property
     def reached(self) -> bool:
@@ -144,7 +161,7 @@ class Plan:
 
     def __repr__(self) -> str:
         to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
-        ends = f"ends {format_mm(self.error_mm)} off, {self.strain_energy_mj:.3g} mJ"
+        ends = f"ends {format_mm(self.error_mm)} off, {self.invasiveness}"
         return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
 
 
@@ -194,6 +211,7 @@ class Period:
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
     converged: bool = True  # solves of the model in this period, and of the virtual phantom up to it
+    stretch: float = math.nan  # least stretch λ of the estimate's tissue
     true_stretch: float | None = None  # minimum stretch λ of the true tissue until now
     miss: Lateral = UNKNOWN  # predicted lateral miss y, z at the target (mm); NaN: not predicted
     miss_sd: float = math.nan  # its standard deviation on an axis (mm)
@@ -256,6 +274,29 @@ class Insertion:
     def flips(self) -> int:
         """Number of applied rolls of the bevel (bevel flips, in the plane)."""
         return sum(period.applied.rolls for period in self.periods)
+
+    @property
+    def invasiveness(self) -> Invasiveness:
+        """Load on the true tissue over the whole insertion; on the estimated one where the truth is not recorded."""
+        plan, periods = self.plan, self.periods
+        true = [
+            (p.true_tip.x, p.true_strain_energy, p.true_stretch)
+            for p in periods
+            if p.true_tip is not None and p.true_strain_energy is not None
+        ]
+        estimated = len(true) < len(periods)
+        states = [(p.estimate.x, p.strain_energy, p.stretch) for p in periods] if estimated else true
+        rows = np.array([(plan.tips[0, X], plan.strain_energy[0], 1.0), *states], dtype=float)
+        steps = [(period.applied.dg_y, period.applied.dg_z) for period in periods]
+        return Invasiveness.measure(
+            rows[:, 0],
+            rows[:, 1],
+            scale=_energy_scale(self.scenario or plan.scenario, self.target),
+            stretch=rows[:, 2],
+            guide_steps=np.array(steps).reshape(-1, 2),
+            rolls=self.flips,
+            estimated=estimated,
+        )
 
     @property
     def warning(self) -> str:
@@ -337,6 +378,10 @@ def is_hit(error_mm: float, scenario: Scenario | None) -> bool:
     """
     diameter = _THIN_MM if scenario is None else scenario.needle.outer_diameter
     return error_mm <= min(0.5 * diameter, TARGET_RADIUS_MM)
+
+
+def _energy_scale(scenario: Scenario | None, target: Point) -> float:
+    return math.nan if scenario is None else scenario.energy_scale(target[0])
 
 
 def scenario_of(record: Plan | Insertion) -> Scenario:

@@ -35,7 +35,7 @@ def weights(scenario, plan, x, memory=None):
 def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
     """Energy relative to the scale of this tissue, line and slope by the path left, late rolls by their effect."""
     found, task, estimate, ahead = weights(PHANTOM, quick_plan, 10.0)
-    settings, scale = task.settings, task.simulator.energy_scale(40.0)
+    settings, scale = task.settings, PHANTOM.energy_scale(40.0)
     assert found == {
         "miss": 1.0,
         "large miss": (ahead.left / 40.0) ** -settings.urgency - 1.0,

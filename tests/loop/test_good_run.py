@@ -47,6 +47,7 @@ def test_record_is_complete_for_every_period(plan, real):
             period.applied, period.command, atol=0.01
         )  # except for the motors' resolution
         assert period.shape.shape == (61, 5)
+        assert period.stretch == 1.0 if period.estimate.x < 0.0 else 0.5 < period.stretch <= 1.0
         assert period.decision
         assert math.isfinite(period.cost)
         assert period.spread > 0.0
@@ -59,6 +60,7 @@ def test_record_is_complete_for_every_period(plan, real):
         parts = period.durations["decide"] + period.durations["observe"]
         assert period.durations["total"] == pytest.approx(parts)
         assert period.converged
+    assert min(period.stretch for period in done.periods) < 1.0
 
 
 def test_the_record_ends_with_the_true_state(plan, real):

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
-from flexneedle.record.fields import COLUMNS, parse_verdict, to_row
+from flexneedle.record.fields import COLUMNS, from_row, parse_verdict, to_row
 from flexneedle.record.messages import joints
 from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import TOPICS
@@ -163,8 +163,28 @@ def test_a_text_that_is_not_a_verdict_is_rejected(text):
         parse_verdict(text)
 
 
+def test_a_row_of_an_earlier_version_has_no_stretch_of_the_estimate():
+    """It is restored as unknown."""
+    row = to_row(PERIODS[0])
+    del row["stretch"]
+    restored = from_row(row, PERIODS[0].shape, {})
+    assert np.isnan(restored.stretch)
+    assert restored.strain_energy == PERIODS[0].strain_energy
+
+
 def test_columns_carry_units():
-    bare = {"index", "verdict", "cost", "action", "decision", "converged", "warning", "late", "true_stretch"}
+    bare = {
+        "index",
+        "verdict",
+        "cost",
+        "action",
+        "decision",
+        "converged",
+        "warning",
+        "late",
+        "stretch",
+        "true_stretch",
+    }
     units = {"mm", "rad", "s", "mj", "n"}
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
 

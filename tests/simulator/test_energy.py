@@ -9,7 +9,7 @@ millimetres of lateral motion, and 0 when the tip is out of the bevel's spring a
 import numpy as np
 import pytest
 
-from flexneedle import Control, Simulator, load_scenario
+from flexneedle import Control, load_scenario
 from flexneedle.types import THETA
 from reference.cases import insert_to, repeat, tight
 
@@ -109,13 +109,3 @@ def test_work_of_drawing_back_is_the_energy_released():
     assert abs(axial) > 0.05 * abs(stored)
     assert errors[1] < 2e-3
     assert errors[1] < errors[0]
-
-
-def test_the_energy_scale_is_of_all_tissue_above_a_depth_displaced_by_a_millimetre():
-    """20 mm of the first layer and 10 of the second, the density of each from the law; weighted by layer."""
-    phantom = load_scenario("phantom").with_values({"tissue.1.energy_weight": 3.0})
-    stretch = 1.0 - 1.0 / 20.0
-    strain = 2.0 * stretch ** (-8.74 / 2.0) + stretch**8.74 - 3.0
-    density = [2.0 * 1e-3 * kpa * 5.2 * 20.0 / 8.74**2 * strain for kpa in (1.82, 3.63)]
-    scale = Simulator(phantom, threads=1).energy_scale(30.0)
-    assert scale == pytest.approx(20.0 * density[0] + 3.0 * 10.0 * density[1], rel=1e-12)

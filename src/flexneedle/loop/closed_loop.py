@@ -244,6 +244,7 @@ def _make_period(
         miss=_pair(step.decision.miss),
         miss_sd=step.decision.miss_sd,
         predicted=step.decision.predicted,
+        stretch=state.least_stretch,
         true_tip=None if truth is None else Pose.of(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
         true_stretch=None if truth is None else truth.least_stretch,

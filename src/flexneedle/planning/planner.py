@@ -174,6 +174,7 @@ def _carry_out(
         converged=solution.search_state.converged,
         history=solution.search_state.history,
         limit=find_limit(simulator.scenario, problem, _make_rollout(simulator, ()), rows, states),
+        least_stretch=np.array([state.least_stretch for state in states]),
         scenario=simulator.scenario,
     )
 

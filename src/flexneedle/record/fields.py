@@ -226,6 +226,7 @@ FIELDS: dict[str, PeriodField] = {
         ),
         page=("true_energy_mj",),
     ),
+    "stretch": PeriodField(_numbers("stretch")),
     "true_stretch": PeriodField(_numbers("true_stretch")),
     "converged": PeriodField((("converged", _flag),)),
     "readings": PeriodField(page=("indicator", _largest_indicator)),
@@ -233,6 +234,8 @@ FIELDS: dict[str, PeriodField] = {
 }
 """Fields of `Period` by name, in the order of the columns. `true_…` are of the virtual phantom, which no controller
 knows. `record.topics` has durations and readings."""
+
+_ADDED = {"stretch": "nan"}  # columns that older traces lack
 
 COLUMNS: tuple[str, ...] = tuple(name for field in FIELDS.values() for name, _ in field.columns)
 """Names of the columns, in order."""
@@ -263,7 +266,7 @@ def from_row(
     readings: tuple[CheckedMeasurement, ...] = (),
 ) -> Period:
     """Return the period of a row and of the values not in it; raises KeyError or ValueError for other rows."""
-    values = {name: _value(field, row) for name, field in FIELDS.items() if field.columns}
+    values = {name: _value(field, {**_ADDED, **row}) for name, field in FIELDS.items() if field.columns}
     return Period(shape=shape, durations=durations, readings=readings, **values)
 
 

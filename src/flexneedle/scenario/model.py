@@ -164,6 +164,14 @@ class Scenario(Section):
             tops.append(tops[-1] + (layer.thickness_mm or 0.0))
         return tuple(tops)
 
+    def energy_scale(self, depth: float) -> float:
+        """Return E₁, the energy (mJ) of all tissue down to `depth` (mm) displaced by 1 mm, weighted by layer."""
+        ends = (*self.layer_tops[1:], max(depth, self.layer_tops[-1]))
+        return sum(
+            layer.energy_weight * layer.energy_per_mm(1.0) * max(0.0, min(end, depth) - top)
+            for layer, top, end in zip(self.tissue, self.layer_tops, ends, strict=True)
+        )
+
 
 def _expand_environment(key: str, value: Any) -> Any:
     """Return the table of an environment's name, for later changes of its values; any other value unchanged."""

@@ -17,10 +17,8 @@ from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.lateral import Lateral, rotate
 from flexneedle.mechanics.model import Adaptation, Model, adapt, check_adaptation, insert_essential, pack
 from flexneedle.mechanics.rollout import Models
-from flexneedle.mechanics.work import CONTACT
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.batch import count_cores, run
 from flexneedle.simulator.build import build_model
 from flexneedle.simulator.control import MOVES, Limits, controls
@@ -44,7 +42,6 @@ from flexneedle.types import COLUMNS, Control, Floats
 
 _MECHANICS = ("needle", "setup", "entry", "tissue", "contact")  # the sections that a state depends on
 _CLOSEST_POINTS_MM = 0.1
-_LATERAL_MM = 1.0
 _ALL_CORES = "leave it out for one per core"
 
 
@@ -254,15 +251,6 @@ class Simulator:
         self._check_points(state, x)
         after = self._assimilate(state, across[0].item(), x, across[order])
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
-
-    def energy_scale(self, depth: float) -> float:
-        """Return the strain energy (mJ) of all tissue down to `depth` (mm) displaced by 1 mm, weighted by layer."""
-        nodes, total = self._model.nodes, 0.0
-        for k, tissue in enumerate(laws_of(self.scenario.tissue)[0]):
-            of = nodes[(nodes["x"] < depth) & (nodes["kind"] == CONTACT) & (nodes["law"] == k)]
-            stored = tissue.energy(np.minimum(_LATERAL_MM / of["height"], tissue.limit))
-            total += float((of["weight"] * of["stiffness"] * of["height"] ** 2 * stored).sum())
-        return total
 
     def _assimilate(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:
         place = self._model.nodes["x"].searchsorted(x)

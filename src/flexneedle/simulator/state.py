@@ -173,6 +173,11 @@ class State:
         )
         return Contacts(*(_freeze(column[formed]) for column in columns))
 
+    @property
+    def least_stretch(self) -> float:
+        """Least stretch λ of the tissue; 1 is unloaded."""
+        return float(self.contacts.stretch.min(initial=1.0))
+
     @cached_property
     def strain_energy(self) -> float:
         """Tissue strain energy Σ w_c W of the contacts (mJ), weighted by layer (paper eq. 12)."""

@@ -23,7 +23,7 @@ from flexneedle.simulator.control import MOVES, Limits
 from flexneedle.testing.checks import require, require_finite, short_scenario
 from flexneedle.types import X
 
-_ARRAYS = ("controls", "tips", "guide", "strain_energy", "shapes")
+_ARRAYS = ("controls", "tips", "guide", "strain_energy", "least_stretch", "shapes")
 _MOST_CALLS = 300
 _DEPTH_MM = 0.5
 

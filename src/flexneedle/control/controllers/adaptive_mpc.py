@@ -83,7 +83,7 @@ class Memory:
 
 def begin(task: Task) -> Memory:
     """Return the memory at the start, with the plan's path."""
-    path, scale = path_of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
+    path, scale = path_of_plan(task.plan), task.scenario.energy_scale(task.plan.target[0])
     return Memory(path, path, task.plan.roll, scale)
 
 

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 from pydantic import ValidationError, model_validator
 
 from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
@@ -11,7 +12,6 @@ from flexneedle.scenario.problems import Problem, problems_of, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
@@ -87,6 +87,14 @@ class Layer(Section):
     def most_bevel_mm(self) -> float:
         """Largest bevel offset that is drawn or fitted."""
         return (self.limit - _BEVEL_MARGIN) * self.compression_length_mm
+
+    def energy_per_mm(self, displacement: float) -> float:
+        """Return the energy (mJ) of the tissue beside 1 mm of needle that is displaced laterally (mm), not weighted."""
+        h = self.compression_length_mm
+        inside = np.minimum([displacement / h], self.limit)
+        beyond = displacement / h - inside
+        stored = self.energy(inside) + (self.force(inside) + 0.5 * self.stiffness(inside) * beyond) * beyond
+        return float(self.modulus * self.engaged_width_mm * h * stored[0])
 
     @abstractmethod
     def energy(self, e: "Floats") -> "Floats":
