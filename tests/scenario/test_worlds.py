@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from flexneedle import load_scenario
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, PLANE, RIGS, structural, world
+from flexneedle.scenario.world_structures import draw_structure
+from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, PLANE, RIGS, world
 
 PRESET = load_scenario("phantom").values()
 NUMBERS = st.integers(0, LARGEST_WORLD)
@@ -135,7 +136,7 @@ def test_a_structural_world_has_one_kind_of_mismatch_more(number):
 @pytest.mark.long
 def test_each_kind_of_structural_mismatch_is_as_likely():
     guided = [(number, found) for number in range(1000) if (found := world(number)).setup.has_guide]
-    kinds = [next(iter(structural(number, found))) for number, found in guided]
+    kinds = [next(iter(draw_structure(number, found))) for number, found in guided]
     _, count = np.unique(kinds, return_counts=True)
     np.testing.assert_allclose(count, len(guided) / 5, atol=35)
 

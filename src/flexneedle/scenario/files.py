@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from flexneedle.arguments import shorten
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario.library import PRESETS, WORLD, Library, label
+from flexneedle.scenario.library import PRESETS, Library, is_world, label
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import describe
 from flexneedle.scenario.sections.environment import ENVIRONMENTS, Environment
@@ -17,10 +17,10 @@ _REGISTRATIONS = Library("a registration file", error=ScenarioError)
 
 
 def load_scenario(source: str | Path | Scenario) -> Scenario:
-    """Return the scenario of a preset, a world (`world:100012`) or a TOML file.
+    """Return the scenario of a preset, a world (`wide:100012`, `world:100012`) or a TOML file.
 
     A scenario is returned unchanged. The name of a preset means the preset, even if a file of that name exists; a name
-    that begins with `world:` is a world.
+    that begins with `wide:` or `world:` is a world.
 
     Raises:
         ScenarioError: One line for each problem: file, key, value, rule.
@@ -29,7 +29,7 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
         return source
     if not isinstance(source, str | Path):
         raise ScenarioError(f"scenario = {shorten(source)}: must be a preset name, a path or a Scenario")
-    if isinstance(source, str) and source.startswith(WORLD):
+    if isinstance(source, str) and is_world(source):
         from flexneedle.scenario.worlds import named_world
 
         return named_world(source)

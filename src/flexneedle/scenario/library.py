@@ -114,5 +114,12 @@ def label(source: str | Path) -> str:
 
 PRESETS = Library("a scenario file", "preset", files(__package__) / "presets", ScenarioError)
 """The scenarios that come with the package."""
+WORLD_KINDS = ("world", "wide")
+"""Kinds of worlds. A name is a kind, a colon, the number and, unless the case is `real`, a colon and the case."""
 WORLD = "world:"
-"""Prefix of the name of a world's scenario; the number follows and, unless it is `real`, a colon and the case."""
+"""Prefix of the name of a world of the first kind."""
+
+
+def is_world(name: str) -> bool:
+    """Return whether a name begins as the name of a world."""
+    return name.startswith(tuple(f"{kind}:" for kind in WORLD_KINDS))

@@ -36,9 +36,9 @@ USUAL = {
         3, 210, "PEEK 3 to 4 (doi:10.1016/j.biomaterials.2007.07.013), nitinol 28 to 83, steel 190 to 210"
     ),
     "needle.bevel.offset_mm": Range(
-        1,
+        0.01,
         14,
-        "our estimate: 1 to 5 in the random worlds, 14 is the model's limit for the usual compression length",
+        "0.01 for a thin wire in stiff gel (docs/worlds.md), 14 is the model's limit for the usual compression length",
     ),
     "needle.bevel.length_mm": Range(
         0.1, 19, "tubing of 0.18 to 3.4 ground at 60 to 10 degrees (J Biomech 2014;47:3344)"
@@ -49,7 +49,9 @@ USUAL = {
         "epidermis 0.075 (doi:10.1016/j.burns.2016.11.014); 200, the length of needles, is our estimate",
     ),
     "tissue.*.shear_modulus_kpa": Range(
-        0.6, 210, "stomach 0.64, liver 1.8, gallbladder 85, artery 210 (doi:10.1088/1361-6560/ab5010)"
+        0.6,
+        680,
+        "stomach 0.64, liver 1.8, gallbladder 85, artery 210 (doi:10.1088/1361-6560/ab5010), stiff gel 680",
     ),
     "tissue.*.alpha": _ALPHA,
     "tissue.*.compression_length_mm": Range(

@@ -268,6 +268,7 @@ def test_the_shipped_studies_load():
         "guide-distance": 7 * 150,
         "gauges": 8 * 150,
         "tracker": 5 * 150,
+        "wide": 1425,
         "worlds": 2202,
         "space": 3 * 4 * 300,
         "worlds-space": 5740,

@@ -65,6 +65,18 @@ def test_points_have_their_world_and_case_and_none_needs_a_guide_that_is_not_the
         assert "world" not in point.varied
 
 
+def test_a_study_may_have_worlds_of_the_wide_kind(load):
+    study = load(
+        STUDY.replace('name = "few"', 'name = "few"\n[values]\nworld_kind = "wide"').replace(
+            "[15, 3]", "[2, 3]"
+        )
+    )
+    for point in study.points:
+        assert point.world_kind == "wide"
+        assert point.scenario == check_tables(world(point.world, point.case, kind="wide"))
+    assert load().points[0].world_kind == "world"
+
+
 def test_other_worlds_can_be_requested(load):
     chosen = load(worlds=(100, 4))
     assert {point.world for point in chosen.points} == {100, 101, 102, 103}
@@ -114,6 +126,7 @@ FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
         ),
         (NAMED + 'values = { world_case = "real" }', None, "world_case: needs an axis of worlds"),
         (NAMED + 'values = { world_rig = "two-axes" }', None, "world_rig: needs an axis of worlds"),
+        (NAMED + 'values = { world_kind = "wide" }', None, "world_kind: needs an axis of worlds"),
         (ODD, None, 'world_case = "odd": must be one of perfect, real, structure'),
         (IN_SPACE.replace('"all"', '["three"]'), None, 'world_rig = "three": must be one of plane, two-axes'),
     ],
@@ -135,6 +148,11 @@ def test_the_shipped_studies_have_two_hundred_worlds_not_used_for_tuning():
         assert {point.plant for point in points} == {plant}
         worlds = numbers if case != "structure" else guided
         assert {point.world for point in points if point.controller == "open-loop"} == worlds
+    study = load_study("wide")
+    assert {(point.world, point.world_kind) for point in study.points} == {
+        (n, "wide") for n in sorted(numbers)
+    }
+    assert {point.case for point in study.points} == {"real", "structure"}
     study = load_study("worlds-space")
     with_guide, without = 4 * 4, 2 * 3  # drivers by controllers; resolved-rate needs a guide
     assert len(study) == 2 * (with_guide * len(guided) + without * (200 - len(guided)))

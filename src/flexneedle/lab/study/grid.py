@@ -27,6 +27,7 @@ from flexneedle.lab.study.spec import (
     TARGET_KEYS,
     WORLD,
     WORLD_CASE,
+    WORLD_KIND,
     WORLD_RIG,
     StudyAxis,
     StudyFile,
@@ -42,10 +43,11 @@ from flexneedle.planning import STRATEGIES
 from flexneedle.plugins import digest_modules, is_own
 from flexneedle.record.plain import plain
 from flexneedle.scenario.alternatives import SHEAR, YOUNG, override, spell
+from flexneedle.scenario.library import WORLD_KINDS
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.settings import Target
-from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
+from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, SOFT, STRUCTURE, has_rig, world
 
 _DEFAULTS = {
     "controller": DEFAULT,
@@ -54,6 +56,7 @@ _DEFAULTS = {
     "strategy": STRATEGIES[0],
     "plan_seed": 0,
 }
+_KIND = {WORLD_CASE: REAL, WORLD_RIG: PLANE, WORLD_KIND: SOFT}
 _CHOICES = {
     "controller": tuple(CONTROLLERS),
     "plant": tuple(PLANTS),
@@ -61,13 +64,14 @@ _CHOICES = {
     "strategy": STRATEGIES,
     WORLD_CASE: CASES,
     WORLD_RIG: RIGS,
+    WORLD_KIND: WORLD_KINDS,
 }
 _DEFAULT_TARGET: dict[str, Any] = dict(zip(TARGET_KEYS, Target().position, strict=True))
 _OWN = {"controller": find_controller, "plant": find_plant, "tracker": find_tracker}
 _CUSTOM = {*_OWN, "law", "term"}
 """Keys, and last parts of keys, that name a custom part."""
 _MAX_INSERTIONS = 1_000_000
-_KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG))
+_KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG, WORLD_KIND))
 _FURTHER_KEYS = f"; further keys of a study: {_KEYS}, as an axis also {SEED}, {WORLD}"
 
 
@@ -76,8 +80,8 @@ class StudyPoint:
     """A point of the grid: the settings shared by its insertions.
 
     varied: values of the axes except target and world; target_number: index of the target in the study, or number of
-    the world; world: that number, None if the scenario is not a world; world_case, world_rig: case and rig of the
-    world; with_reach: whether the reach of its insertions is computed.
+    the world; world: that number, None if the scenario is not a world; world_case, world_rig, world_kind: case, rig
+    and kind of the world; with_reach: whether the reach of its insertions is computed.
     """
 
     scenario: Scenario
@@ -92,6 +96,7 @@ class StudyPoint:
     world: int | None = None
     world_case: str = ""
     world_rig: str = ""
+    world_kind: str = ""
     with_reach: bool = False
 
 
@@ -283,7 +288,7 @@ class _Parts:
 
 @dataclass(frozen=True)
 class _Choice:
-    """Settings of a point before its scenario is made. chosen: values of the axes; kind: case and rig of a world."""
+    """Settings of a point before its scenario is made. chosen: values of the axes; kind: case, rig, kind of a world."""
 
     case: str
     chosen: Mapping[str, Any]
@@ -312,7 +317,7 @@ class StudyGrid:
         return self._made[number]
 
 
-def _list_choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[_Choice]:
+def _list_choices(parts: _Parts, worlds: Callable[..., Scenario]) -> Iterator[_Choice]:
     """Yield the settings of the points; later settings override earlier ones."""
     numbers: dict[Any, int] = {}
     start = _DEFAULT_TARGET | {
@@ -324,9 +329,9 @@ def _list_choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[
         settings = override(override(parts.fixed, parts.cases[case]), flatten_settings(chosen))
         run = {key: settings.pop(key) for key in _DEFAULTS}
         number = settings.pop(WORLD, None)
-        kind = {WORLD_CASE: settings.pop(WORLD_CASE, REAL), WORLD_RIG: settings.pop(WORLD_RIG, PLANE)}
+        kind = {key: settings.pop(key, default) for key, default in _KIND.items()}
         _check_run(run | kind)
-        if number is not None and _is_skipped(worlds(number), run["controller"], *kind.values()):
+        if number is not None and _is_skipped(worlds(number, kind=kind[WORLD_KIND]), run["controller"], kind):
             continue
         own = numbers.setdefault(_target_key(start | settings), len(numbers)) if number is None else number
         yield _Choice(case, chosen, settings, run, number, kind, own)
@@ -357,11 +362,11 @@ def _make_point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario])
     )
 
 
-def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:
+def _is_skipped(scenario: Scenario, controller: str, kind: Mapping[str, str]) -> bool:
     """Return whether the rig does not fit the guide of a world, or the case or the controller needs a guide."""
-    return not has_rig(scenario, world_rig) or (
+    return not has_rig(scenario, kind[WORLD_RIG]) or (
         not scenario.setup.has_guide
-        and (world_case == STRUCTURE or find_controller(controller)[1].needs_guide)
+        and (kind[WORLD_CASE] == STRUCTURE or find_controller(controller)[1].needs_guide)
     )
 
 

@@ -20,8 +20,8 @@ from flexneedle.scenario.sections.fields import Section, Title, count
 from flexneedle.scenario.worlds import LARGEST_WORLD
 
 SEED, ALL = "seed", "all"
-WORLD, WORLD_CASE, WORLD_RIG = "world", "world_case", "world_rig"
-NAMED = ("controller", "plant", "strategy", WORLD_CASE, WORLD_RIG)
+WORLD, WORLD_CASE, WORLD_RIG, WORLD_KIND = "world", "world_case", "world_rig", "world_kind"
+NAMED = ("controller", "plant", "strategy", WORLD_CASE, WORLD_RIG, WORLD_KIND)
 TARGET = "target"
 TARGET_KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
 STUDIES = Library("a study file", "study", files(__package__) / "studies")
@@ -47,10 +47,10 @@ class StudyAxis(Section):
 
     key: Annotated[str, AfterValidator(spell)]
     """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case,
-    world_rig."""
+    world_rig, world_kind."""
     values: Any
-    """A list; "all" for every controller, plant, strategy, case or rig of a world; {from, count} for consecutive seeds
-    or worlds."""
+    """A list; "all" for every controller, plant, strategy, case, rig or kind of a world; {from, count} for consecutive
+    seeds or worlds."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "StudyAxis":
@@ -252,6 +252,6 @@ def _check_worlds(study: StudyFile) -> Iterator[Problem]:
         for key in sorted({"scenario", "without"} & study.model_fields_set):
             yield Problem(key, getattr(study, key), "remove it: an axis sets the worlds")
     else:
-        for key in (WORLD_CASE, WORLD_RIG):
+        for key in (WORLD_CASE, WORLD_RIG, WORLD_KIND):
             if key in axes.union(study.values, *(case.values for case in study.cases)):
                 yield Problem(key, None, "needs an axis of worlds")

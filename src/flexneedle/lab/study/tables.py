@@ -34,6 +34,7 @@ _CONDITIONS: dict[str, tuple[type, Callable[[StudyInsertion, str], Any]]] = {
     "world": (int, lambda insertion, _: insertion.point.world),
     "world_case": (str, lambda insertion, _: insertion.point.world_case),
     "world_rig": (str, lambda insertion, _: insertion.point.world_rig),
+    "world_kind": (str, lambda insertion, _: insertion.point.world_kind),
 }
 _TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
 

@@ -19,7 +19,10 @@ _UNITS = {
     "per_mm": "1/mm", "per_m": "1/m", "per_mj": "1/mJ", "mn_per_mm": "mN/mm", "mm_s": "mm/s",
     "mm": "mm", "mrad": "mrad", "kpa": "kPa", "gpa": "GPa", "hz": "Hz", "mj": "mJ", "s": "s",
 }  # fmt: skip
-_LABELS = {"world_rig": "rig", "needle.gauge": "needle gauge", "tracker.environment": "tracker environment"}
+_LABELS = {
+    "world_rig": "rig", "world_kind": "kind of world", "needle.gauge": "needle gauge",
+    "tracker.environment": "tracker environment",
+}  # fmt: skip
 _NUMBERED = re.compile(r"([^\d.+-]*)([-+]?(?:\d+\.?\d*|\.\d+))([^\d.]*)")
 
 
