@@ -58,7 +58,7 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0, step=STEP):
     return Plan(
         strategy, (*target, 0.0)[:3], seed, 0.0, controls, tips, energy, np.column_stack([guide, 0.0 * guide]), shapes,
         sum(terms.values()), terms,
-        12, True, history, "", 0.71,
+        12, True, history, "", 0.71, least_stretch=1.0 - 0.1 * inside,
     )  # fmt: skip
 
 

@@ -142,6 +142,6 @@ def test_all_values_are_in_the_rows():
     """In the order of the record."""
     load = Invasiveness(1234.5, 0.0123456, 3.0, 6.0, 0.95, 7.25, 4)
     text = " ".join(load.rows("rolls").values())
-    for shown in ("1230, 0.0123, 3 µJ", "206, 0.00206, 0.5", "0.950", "7.25 mm", "4"):
+    for shown in ("1230, 0.0123, 3 µJ", "206, 0.00206, 0.5", "0.95", "7.25 mm", "4"):
         assert shown in text
     assert load.rows("rolls") != replace(load, estimated=True).rows("rolls")

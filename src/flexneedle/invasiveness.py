@@ -1,6 +1,7 @@
 """Load on the tissue over a whole insertion: stored energy, compression, motion of the guide, rolls."""
 
 from dataclasses import dataclass
+from math import isnan
 from typing import Self
 
 import numpy as np
@@ -84,28 +85,30 @@ class Invasiveness:
         peak, mean, end = (energy / scale for energy in self.energies_uj)
         return peak, mean, end
 
-    def rows(self, turns: str) -> dict[str, str]:
+    @property
+    def energies(self) -> str:
+        """Peak, mean and end of the energy as text."""
+        peak, mean, end = map(_format_number, self.energies_uj)
+        return f"peak {peak}, mean {mean}, end {end} µJ"
+
+    def rows(self, turns: str = "rolls") -> dict[str, str]:
         """Return the values as text by name, for tables; turns: name for rolls of the bevel."""
-        of = "the estimated tissue" if self.estimated else "the tissue"
-        energies, relative = map(_join, (self.energies_uj, self.relative_energies))
+        tissue = "estimated tissue" if self.estimated else "tissue"
+        energies, relative = (
+            ", ".join(map(_format_number, values)) for values in (self.energies_uj, self.relative_energies)
+        )
         return {
-            f"energy of {of}: peak, mean, end": f"{energies} µJ",
-            "  relative to 1 mm of displacement": relative,
-            f"least stretch of {of}": f"{self.least_stretch:.3f}",
+            f"{tissue} energy: peak, mean, end": f"{energies} µJ",
+            "  relative to E₁": relative,
+            f"least stretch of the {tissue}": _format_number(self.least_stretch),
             "guide travel in the tissue": f"{self.guide_travel_mm:.2f} mm",
             turns: str(self.rolls),
         }
 
     def __str__(self) -> str:
-        """Energies in a line."""
-        peak, mean, end = map(format_number, self.energies_uj)
-        return f"tissue energy peak {peak}, mean {mean}, end {end} µJ"
+        return "; ".join(f"{name.strip()} {text}" for name, text in self.rows().items())
 
 
-def format_number(value: float) -> str:
+def _format_number(value: float) -> str:
     """Return a number with three significant digits."""
-    return f"{float(f'{value:.3g}'):g}"
-
-
-def _join(values: tuple[float, ...]) -> str:
-    return ", ".join(map(format_number, values))
+    return "unknown" if isnan(value) else f"{float(f'{value:.3g}'):g}"

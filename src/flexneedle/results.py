@@ -63,10 +63,10 @@ class Plan:
         converged: Whether the search converged.
         history: One dict per iteration of the planner.
         limit: Limit that binds if the target is out of reach, else "".
-        least_stretch: Least stretch λ of the tissue (m + 1,); NaN (1,): unknown.
         seconds: Wall-clock time (s) of the search.
         scenario: Scenario of the plan, None if unknown.
         versions: Versions that made a loaded plan, by package; empty for a new one.
+        least_stretch: Least stretch λ of the tissue (m + 1,); NaN (1,): unknown.
     """
 
     strategy: str
@@ -84,10 +84,10 @@ class Plan:
     converged: bool
     history: tuple[dict[str, Any], ...]
     limit: str  # which limit binds if the target is out of reach, else ""
-    least_stretch: Floats = field(default_factory=lambda: np.full(1, math.nan))
     seconds: float = field(default=0.0, compare=False)  # wall clock
     scenario: Scenario | None = None
     versions: Mapping[str, str] = field(default_factory=dict, compare=False)
+    least_stretch: Floats = field(default_factory=lambda: np.full(1, math.nan))
 
     @property
     def tip_mm(self) -> Point:
@@ -161,7 +161,7 @@ class Plan:
 
     def __repr__(self) -> str:
         to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
-        ends = f"ends {format_mm(self.error_mm)} off, {self.invasiveness}"
+        ends = f"ends {format_mm(self.error_mm)} off, tissue energy {self.invasiveness.energies}"
         return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
 
 

@@ -10,6 +10,14 @@ pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 STRATEGIES = ("manipulation", "steering")
 PLAN_KEYS = [
     *("tip_mm", "error_mm", "reached", "entry", "cost", "terms", "flips", "strain_energy_mj"),
+    *(
+        "peak_energy_uj",
+        "mean_energy_uj",
+        "end_energy_uj",
+        "least_stretch",
+        "guide_travel_mm",
+        "energy_scale_uj",
+    ),
     *("iterations", "converged", "seed", "timing"),
 ]
 

@@ -25,7 +25,10 @@ INSERT_KEYS = [
     *("controller", "phantom", "rig", "dry_run", "disturbed"),
     *("target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm", "planned_error_mm"),
     *("reached", "outcome", "reason", "warning", "flips", "planned_flips"),
-    *("strain_energy_mj", "planned_strain_energy_mj", "steps", "held_s"),
+    *("strain_energy_mj", "planned_strain_energy_mj"),
+    *("peak_energy_uj", "mean_energy_uj", "end_energy_uj", "least_stretch", "guide_travel_mm"),
+    *("planned_peak_energy_uj", "planned_mean_energy_uj", "planned_end_energy_uj", "planned_least_stretch"),
+    *("planned_guide_travel_mm", "energy_scale_uj", "energy_estimated", "steps", "held_s"),
     *("converged", "seed", "run_dir", "timing"),
 ]
 
@@ -66,6 +69,10 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     assert result["true_error_mm"] == pytest.approx(0.07)
     assert (result["flips"], result["planned_flips"], result["steps"], result["seed"]) == (3, 1, 23, 3)
     assert result["strain_energy_mj"] == pytest.approx(1.25 * result["planned_strain_energy_mj"])
+    assert result["end_energy_uj"] == 1e3 * result["strain_energy_mj"]
+    assert result["mean_energy_uj"] < result["peak_energy_uj"]
+    assert result["planned_end_energy_uj"] == 1e3 * result["planned_strain_energy_mj"]
+    assert result["energy_estimated"] is False
     assert set(result["timing"]) == {"plan_seconds", "period_ms"}
     assert result["timing"]["period_ms"]["max"] == pytest.approx(5.1 + 0.01 * 22)
     stored = read(result["run_dir"])

@@ -191,9 +191,22 @@ def test_panels_show_error_motion_and_energy_over_depth():
     (applied,) = lines(motion, "applied")
     np.testing.assert_array_equal(applied.get_ydata(), [period.guide[0] for period in INSERTION.periods])
     (planned,) = lines(energy, "planned")
-    np.testing.assert_array_equal(planned.get_ydata(), INSERTION.plan.strain_energy)
+    np.testing.assert_array_equal(planned.get_ydata(), 1e3 * INSERTION.plan.strain_energy)
     (stored,) = lines(energy, "true")
-    assert stored.get_ydata()[-1] == INSERTION.periods[-1].true_strain_energy
+    assert stored.get_ydata()[-1] == 1e3 * INSERTION.periods[-1].true_strain_energy
+
+
+@pytest.mark.parametrize("kind", ["insertion", "plan"])
+@unarranged()
+def test_the_peak_of_the_energy_is_marked(kind):
+    """Before the end, where it is; of an insertion also the plan's."""
+    plan = replace(PLANS[0], strain_energy=1.0 - np.abs(PLANS[0].tips[:, 0] - 20.6) / 100.0)
+    insertion = replace(INSERTION, plan=plan)
+    figure = insertion_figure(PHANTOM, insertion) if kind == "insertion" else plan_figure(PHANTOM, [plan])
+    (energy,) = axes(figure, "energy")
+    marks = [tuple(line.get_xydata()[0]) for line in energy.get_lines() if line.get_marker() == "D"]
+    end = (40.0, insertion.invasiveness.peak_energy_uj)
+    assert marks == [(20.5, plan.invasiveness.peak_energy_uj), *([end] if kind == "insertion" else [])]
 
 
 def test_a_line_that_went_nowhere_ends_in_a_dot_and_is_named():
@@ -217,7 +230,9 @@ def test_a_panel_without_a_line_gives_the_reason():
     assert [text.get_text() for text in error.texts] == ["no data: tracker, true"]
     assert error.get_legend() is None
     assert not [*motion.texts, *energy.texts]
-    assert names(energy.get_legend()) == ["planned"]
+    assert names(energy.get_legend()) == ["planned", "estimated"]
+    (estimate,) = lines(energy, "estimated")
+    assert estimate.get_ydata()[-1] == 1e3 * INSERTION.periods[-1].strain_energy
 
 
 @unarranged()

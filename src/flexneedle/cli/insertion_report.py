@@ -8,6 +8,7 @@ from flexneedle.cli.common import entry_rows, print_json, print_table, target_ro
 from flexneedle.cli.progress import print_note
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from flexneedle.results import Insertion
@@ -45,10 +46,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("  measured", _number(result["residual_mm"], "mm")),
         ("  planned", _number(result["planned_error_mm"], "mm")),
         *_registration(scenario, insertion),
-        ("strain energy of the true tissue", _number(result["strain_energy_mj"], "mJ")),
-        ("  planned", _number(result["planned_strain_energy_mj"], "mJ")),
-        (scenario.setup.turns, str(insertion.flips)),
-        ("  planned", str(insertion.plan.flips)),
+        *_invasiveness(scenario, insertion),
         ("control periods", str(result["steps"])),
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         *([("late decisions", str(insertion.late))] if insertion.late else []),
@@ -83,6 +81,14 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
         return []
     error = expected_error(scenario.tracker.registration, insertion.target)
     return [("  expected registration error", _number(error, "mm"))]
+
+
+def _invasiveness(scenario: Scenario, insertion: Insertion) -> Iterator[tuple[str, str]]:
+    """Yield the rows of the load on the tissue, each followed by the plan's."""
+    turns = scenario.setup.turns
+    done, planned = insertion.invasiveness.rows(turns), insertion.plan.invasiveness.rows(turns)
+    for (name, value), plan in zip(done.items(), planned.values(), strict=True):
+        yield from ((name, value), ("  planned", plan))
 
 
 def _number(value: float | None, unit: str) -> str:

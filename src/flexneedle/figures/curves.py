@@ -128,10 +128,16 @@ def applied_motion(insertion: Insertion, guided: bool, axis: int = Y) -> Floats:
     return np.array([p.guide[lateral] if guided else p.base[axis] for p in insertion.periods])
 
 
+def estimated_energy(insertion: Insertion) -> Floats:
+    """Return depth of the estimated tip (mm) and energy of the estimated tissue (µJ) (k, 2)."""
+    rows = [(period.estimate.x, 1e3 * period.strain_energy) for period in insertion.periods]
+    return np.array(rows, dtype=float).reshape(-1, 2)
+
+
 def true_energy(insertion: Insertion) -> Floats:
-    """Return depth of the true tip (mm) and energy of the true tissue (mJ) (k, 2), where they are known."""
+    """Return depth of the true tip (mm) and energy of the true tissue (µJ) (k, 2), where they are known."""
     known = [
-        (period.true_tip.x, period.true_strain_energy)
+        (period.true_tip.x, 1e3 * period.true_strain_energy)
         for period in insertion.periods
         if period.true_tip is not None and period.true_strain_energy is not None
     ]

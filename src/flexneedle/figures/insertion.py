@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from flexneedle.figures import curves, scene, space
 from flexneedle.figures.labels import name_parts
 from flexneedle.figures.layout import COLUMNS, fit, mosaic, short
-from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
+from flexneedle.figures.panels import ENERGY, DepthPanel, Line, draw_depths, draw_timeline
 from flexneedle.figures.scene import View
 from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TRUE, apply_style, is_column, tone
 from flexneedle.results import Insertion, format_mm
@@ -186,11 +186,13 @@ def _roll(insertion: Insertion) -> DepthPanel:
 
 def _energy(insertion: Insertion) -> DepthPanel:
     plan, truth = insertion.plan, curves.true_energy(insertion)
+    estimate = curves.estimated_energy(insertion)
+    name, shown, color = ("true", truth, TRUE) if len(truth) else ("estimated", estimate, ESTIMATE)
     lines = [
-        Line("planned", plan.tips[:, X], plan.strain_energy, PLAN, "--"),
-        Line("true", truth[:, 0], truth[:, 1], TRUE),
+        Line("planned", plan.tips[:, X], 1e3 * plan.strain_energy, PLAN, "--"),
+        Line(name, shown[:, 0], shown[:, 1], color),
     ]
-    return DepthPanel("Energy stored in the tissue (mJ)", lines, 0.01)
+    return DepthPanel(ENERGY, lines, 1.0, peaks=True)
 
 
 def _field(ax: Axes, scenario: Scenario, insertion: Insertion, field: Floats) -> None:

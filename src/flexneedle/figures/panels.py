@@ -16,6 +16,7 @@ from flexneedle.types import Floats
 _ANGLES = (15, 30, 45, 90, 180, 360, 720, 1440)  # distances of ticks at angles (degrees)
 _TICKS = 4
 _ROW, _HANDLE = 56, 6  # characters: of a line of names above a panel, of the mark of a name
+ENERGY = "Energy stored in the tissue (µJ), ◇ peak"
 _VISIBLE = 0.008  # least extent of a visible line, as a share of the panel's width
 
 
@@ -34,13 +35,14 @@ class Line:
 class DepthPanel:
     """Lines over the depth of the tip; the y axis spans at least `least`.
 
-    angles: the lines are angles in degrees.
+    angles: the lines are angles in degrees; peaks: the largest value of each line is marked.
     """
 
     title: str
     lines: Sequence[Line]
     least: float
     angles: bool = False
+    peaks: bool = False
 
 
 def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthPanel]) -> None:
@@ -74,6 +76,11 @@ def _draw_panel(ax: Axes, scenario: Scenario, panel: DepthPanel) -> None:
     for line in panel.lines:
         if len(line.x) and line.style != "o":
             ax.plot(line.x[-1], line.y[-1], "o", color=line.color, markersize=3, zorder=3.5)
+        if len(line.x) and panel.peaks:
+            k = int(np.argmax(np.nan_to_num(line.y)))
+            ax.plot(
+                line.x[k], line.y[k], "D", color=line.color, markerfacecolor="white", markersize=4, zorder=3.6
+            )
     _set_height(ax, panel)
     if not any(_is_visible(line, float(np.ptp(ax.get_xlim()))) for line in panel.lines):
         middle: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "va": "center"}

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from flexneedle.figures import curves, scene, space
 from flexneedle.figures.labels import name_parts
 from flexneedle.figures.layout import fit, mosaic, short
-from flexneedle.figures.panels import DepthPanel, Line, draw_depths
+from flexneedle.figures.panels import ENERGY, DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
 from flexneedle.figures.style import INK, STRATEGIES, apply_style, format_signed, is_column, small, tone
 from flexneedle.results import Plan, format_mm
@@ -150,10 +150,10 @@ def _roll(plans: Sequence[Plan]) -> DepthPanel:
 
 def _energy(plans: Sequence[Plan]) -> DepthPanel:
     lines = [
-        Line(plan.strategy, plan.tips[:, X], plan.strain_energy, color)
+        Line(plan.strategy, plan.tips[:, X], 1e3 * plan.strain_energy, color)
         for plan, color in zip(plans, STRATEGIES, strict=False)
     ]
-    return DepthPanel("Energy stored in the tissue (mJ)", lines, 0.01)
+    return DepthPanel(ENERGY, lines, 1.0, peaks=True)
 
 
 def _write_terms(ax: Axes, plans: Sequence[Plan], names: Sequence[str]) -> None:

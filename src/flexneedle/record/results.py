@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import hypot, isnan
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,9 @@ from flexneedle.record.plain import plain
 from flexneedle.results import Insertion, Outcome, Period, Plan
 from flexneedle.types import X
 
+LOAD = ("peak_energy_uj", "mean_energy_uj", "end_energy_uj", "least_stretch", "guide_travel_mm")
+"""Values of `Invasiveness` that are columns, of insertions and, after "planned_", of plans."""
+PLANNED_LOAD = tuple(f"planned_{name}" for name in LOAD)
 RESULT_KEYS = (
     *(
         "controller",
@@ -26,7 +29,15 @@ RESULT_KEYS = (
         "residual_mm",
     ),
     *("planned_error_mm", "reached", "outcome", "reason", "warning", "flips", "planned_flips"),
-    *("strain_energy_mj", "planned_strain_energy_mj", "steps", "held_s", "converged", "seed"),
+    *(
+        "strain_energy_mj",
+        "planned_strain_energy_mj",
+        *LOAD,
+        *PLANNED_LOAD,
+        "energy_scale_uj",
+        "energy_estimated",
+    ),
+    *("steps", "held_s", "converged", "seed"),
 )
 """Keys of the result of an insertion, in order."""
 DEPTH_FRACTIONS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
@@ -63,6 +74,11 @@ def _true_tip(insertion: Insertion, axis: int) -> float | None:
 def _true_state(insertion: Insertion, name: str) -> Any:
     """Return a `true_…` value of the last period."""
     return getattr(_last(insertion), name, None)
+
+
+def _load(record: Plan | Insertion, name: str) -> float:
+    value: float = getattr(record.invasiveness, name)
+    return value
 
 
 def sds_column(fraction: str, part: str, axis: str) -> str:
@@ -150,11 +166,12 @@ RESULT_COLUMNS: dict[str, ResultColumn] = {
     "planned_flips": ResultColumn(int, of_plan=lambda plan: plan.flips),
     "strain_energy_mj": ResultColumn(float, of_insertion=partial(_true_state, name="true_strain_energy")),
     "planned_strain_energy_mj": ResultColumn(float, of_plan=lambda plan: plan.strain_energy_mj),
+    **{
+        name: ResultColumn(float, of_insertion=partial(_load, name=name))
+        for name in (*LOAD, "energy_scale_uj")
+    },
+    **{f"planned_{name}": ResultColumn(float, of_plan=partial(_load, name=name)) for name in LOAD},
     "planned_error_mm": ResultColumn(float, of_plan=lambda plan: plan.error_mm),
-    "guide_travel_mm": ResultColumn(
-        float, of_insertion=lambda i: sum(hypot(p.applied.dg_y, p.applied.dg_z) for p in i.periods)
-    ),
-    "peak_stretch": ResultColumn(float, of_insertion=partial(_true_state, name="true_stretch")),
     "periods": ResultColumn(int, of_insertion=lambda i: len(i.periods)),
     "planned_periods": ResultColumn(int, of_plan=lambda plan: len(plan.controls)),
     "held_s": ResultColumn(float, of_insertion=lambda i: i.held_s),
@@ -201,6 +218,7 @@ def plan_result(plan: Plan) -> dict[str, Any]:
             "terms": plan.terms,
             "flips": plan.flips,
             "strain_energy_mj": plan.strain_energy_mj,
+            **{name: _load(plan, name) for name in (*LOAD, "energy_scale_uj")},
             "iterations": plan.iterations,
             "converged": bool(plan.converged),
             "seed": plan.seed,
@@ -229,6 +247,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
         "tip_measured_mm": _measured_tip(insertion),
         "reached": bool(insertion.reached),
         "warning": row["warning"] or None,
+        "energy_estimated": insertion.invasiveness.estimated,
         "steps": row["periods"],
         "converged": row["unconverged_periods"] == 0,
         "seed": insertion.seed,
