@@ -56,6 +56,7 @@ NOT_NEGATIVE += _keys("""
     phantom: start_angle_z_sd_mrad direction_spread_deg start_axial_sd_mm youngs_modulus_variation initial_bend_mm
     phantom: run_out_mm guide_clearance_mm friction_mn_per_mm rotation_friction_mn motor_resolution_mm
     phantom: delay_periods missing_fraction tracker_bias_mm
+    phantom.structure: spring_back_mm
     plan: advance_sigma_mm guide_sigma_mm base_sigma_mm base_turn_sigma_mrad smoothing
     tissue[0]: energy_weight
     tracker: jitter_mm tip_offset_mm
@@ -129,6 +130,8 @@ RULES = [
     ("phantom.direction_spread_deg", 90.1, "must be at most 90"),
     ("phantom.youngs_modulus_variation", 1.0, "must be below 1"),
     ("phantom.structure.guide_shift_mm", -2e6, "must be at least -1e+06"),
+    ("phantom.structure.modulus_drift", -1.0, "must be at least -0.9"),
+    ("phantom.structure.modulus_drift", 11.0, "must be at most 10"),
     ("phantom.shear_modulus_factor[0]", 0.0, ABOVE_ZERO),
     ("phantom.bevel_factor[0]", -0.1, "must be at least 0"),
     ("phantom.shear_modulus_factor", [1.6, 0.6], "the low end must not be above the high end"),

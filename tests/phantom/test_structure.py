@@ -1,5 +1,7 @@
 """Structural mismatch: the effects of `[phantom.structure]` on the true phantom, and no others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -45,6 +47,16 @@ def test_a_structural_change_does_not_change_other_draws(structure, expected):
         before, after = plain.scenario.flat(), changed.scenario.flat()
         assert {key: value for key, value in after.items() if before[key] != value} == expected
         assert changed.variation == plain.variation
+
+
+@pytest.mark.parametrize(
+    ("key", "field"),
+    [("yield_mm", "yield_mm"), ("spring_back_mm", "spring_back"), ("modulus_drift", "modulus_drift")],
+)
+def test_a_change_of_the_plant_is_in_the_truth_beside_its_scenario(key, field):
+    plain, changed = truth_of(PHANTOM), truth_of(structured(**{key: 0.4}))
+    assert changed == replace(plain, **{field: 0.4})
+    assert changed.scenario.phantom.structure == PHANTOM.phantom.structure
 
 
 @given(
@@ -97,6 +109,9 @@ def test_the_start_error_is_at_most_half_of_the_distance_to_the_shifted_guide():
         (PHANTOM, {"guide_shift_mm": -27.5}, "guide_shift_mm = -27.5: must be between"),
         (PHANTOM, {"bevel_length_factor": 50.0}, "bevel_length_factor = 50.0: "),
         (PHANTOM, {"alpha": 0.0}, "alpha = 0.0: must not be 0"),
+        (PHANTOM, {"yield_mm": 0.0}, "yield_mm = 0.0: must be above 0"),
+        (PHANTOM, {"spring_back_mm": -0.1}, "spring_back_mm = -0.1: must be at least 0"),
+        (PHANTOM, {"modulus_drift": -1.0}, "modulus_drift = -1.0: must be at least -0.9"),
         (PHANTOM, {"hidden_layer": {"top_mm": 3.0}}, "hidden_layer.thickness_mm: missing"),
         (PHANTOM, {"compression_factor": 2.0}, "compression_factor = 2.0: unknown key"),
         (NO_GUIDE, {"guide_shift_mm": 1.0}, "guide_shift_mm = 1.0: there is no guide"),

@@ -59,6 +59,7 @@ _ON_A_BENCH = {
         [Ogden(alpha=6.0, shear_modulus_kpa=1.0, compression_length_mm=20.0, engaged_width_mm=1.0)]
     ),
     "law": np.array([0]),
+    "channel_law": np.array([0]),
     "height": np.array([20.0]),
     "foundation": np.array([0.0]),
     "weight": np.array([1.0]),

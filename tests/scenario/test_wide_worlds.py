@@ -114,6 +114,59 @@ def test_a_needle_with_the_bevel_of_a_radius_follows_this_radius(stiffness, shea
     assert 1.0 / np.polyfit(x, slope, 1)[0] == pytest.approx(radius, rel=0.02)
 
 
+def structure(number):
+    return wide(number, "structure").phantom.structure
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (0, {"spring_back_mm": 0.442}),
+        (3, {"compression_length_factor": 0.945}),
+        (7, {"spring_back_mm": 0.911}),
+        (100001, {"modulus_drift": -0.239}),
+        (100002, {"yield_mm": 0.95}),
+        (100004, {"compression_length_factor": 1.052}),
+    ],
+)
+def test_a_number_gives_the_same_structural_mismatch_forever(number, expected):
+    assert structure(number).model_dump(exclude_defaults=True) == expected
+
+
+@given(number=NUMBERS)
+@many_worlds
+def test_a_wide_world_has_one_kind_of_structural_mismatch_in_its_range(number):
+    scenario = wide(number)
+    if not scenario.setup.has_guide:
+        with pytest.raises(ScenarioError, match=r"^wide world .* has no guide"):
+            wide(number, "structure")
+        return
+    found, plain = structure(number), scenario.phantom.structure
+    values = found.model_dump()
+    assert sum(value != plain.model_dump()[key] for key, value in values.items()) <= 1
+    assert 0.3 <= (found.yield_mm or 0.3) <= 1.0
+    assert 0.04 <= (found.spring_back_mm or 0.04) <= 1.0
+    assert abs(found.modulus_drift) <= 0.25
+    if (hidden := found.hidden_layer) and hidden.top_mm == 0.0:
+        assert 0.5 <= hidden.thickness_mm <= 3.0
+        assert 3.0 <= hidden.modulus_factor <= 10.0
+        assert scenario.tissue[0].name != "skin"
+
+
+@pytest.mark.long
+def test_each_kind_of_structural_mismatch_is_as_likely():
+    """Of 1000 worlds 800 have a guide; with a hidden skin in the seven tenths without a skin."""
+    kinds = [
+        "skin" if (hidden := found.get("hidden_layer")) and hidden["top_mm"] == 0.0 else next(iter(found))
+        for number in range(1000)
+        if wide(number).setup.has_guide and (found := structure(number).model_dump(exclude_defaults=True))
+    ]
+    names, counts = np.unique(kinds, return_counts=True)
+    assert len(names) == 9
+    expected = [62 if name == "skin" else 92 for name in names]
+    np.testing.assert_allclose(counts, expected, atol=32)
+
+
 @pytest.mark.long
 def test_wide_worlds_have_the_documented_shares():
     """Shares of a thousand: skin 30 %, guide 80 %, levels evenly over the logarithm, largest bevel offset 32 %."""

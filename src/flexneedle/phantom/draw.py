@@ -36,6 +36,9 @@ class Truth:
         run_out_angle: Angle of the run-out from the bevel (rad).
         load: Constant force y, z on the tip (N).
         split: True tops of layers (mm) where a hidden layer splits them, else empty.
+        yield_mm: Lateral displacement (mm) from which the tissue tears, or None.
+        spring_back: Length (mm) by which the base springs back where its advance stops in tissue.
+        modulus_drift: Relative change of all moduli from the skin to the target.
     """
 
     scenario: Scenario
@@ -52,6 +55,9 @@ class Truth:
     run_out_angle: float = 0.0
     load: tuple[float, float] = (0.0, 0.0)
     split: tuple[float, ...] = ()
+    yield_mm: float | None = None
+    spring_back: float = 0.0
+    modulus_drift: float = 0.0
 
     @property
     def layer_tops(self) -> tuple[float, ...]:
@@ -104,6 +110,9 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         bend_angle,
         run_out_angle,
         split=() if truth is layered else layered.layer_tops,
+        yield_mm=settings.structure.yield_mm,
+        spring_back=settings.structure.spring_back_mm,
+        modulus_drift=settings.structure.modulus_drift,
     )
 
 

@@ -243,7 +243,12 @@ def _extend(rod: Rod, s: State, channel: Records, count: int, segments: int) -> 
         place = plus(front, times((at - s.cut) / cut, way))
         c = min(int(place[0] / rod.cell), rod.law.size - 1)
         put(point.place, place)
-        point.cut, point.segment, point.law, point.height = at, segments - 1, rod.law[c], rod.height[c]
+        point.cut, point.segment, point.law, point.height = (
+            at,
+            segments - 1,
+            rod.channel_law[c],
+            rod.height[c],
+        )
         point.stiffness, point.weight = rod.foundation[c] * rod.spacing, rod.weight[c]
         count += 1
     if (count + 0.5) * rod.spacing < s.cut + cut:  # no room for more points: the tissue is incomplete

@@ -9,6 +9,7 @@ import numpy as np
 
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
+from flexneedle.phantom.spring_back import SpringBack
 from flexneedle.simulator.control import MOVES, Limits, limit_half_turn, roll_time
 from flexneedle.types import (
     COLUMNS,
@@ -20,6 +21,7 @@ from flexneedle.types import (
     PSI,
     ROLL,
     SPIN,
+    STILL,
     THETA,
     Control,
     Floats,
@@ -55,6 +57,7 @@ class Phantom:
         self._plant = make_plant(kind, truth, roll)
         self._truth = truth
         self._limits = Limits.of(truth.scenario)
+        self._spring_back = SpringBack(truth.spring_back)
         self._moved, self._rolled = np.zeros(MOVES), roll
         self._remainder = np.zeros(MOVES)  # of all commands after rounding to motor steps
         self._time = 0.0
@@ -74,6 +77,8 @@ class Phantom:
 
     def wait(self, seconds: float) -> None:
         """Wait with the needle at rest."""
+        if self._truth.spring_back > 0.0:
+            self._step(np.array(STILL), self._time)
         self._time += seconds
         self._path.append((self._time, *self._tip().tolist()))
 
@@ -134,8 +139,9 @@ class Phantom:
 
     def _step(self, row: Floats, time: float) -> None:
         """Step the plant, which ends at `time` (s)."""
-        self._plant.step(row)
-        self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
+        for part in self._spring_back.steps(row, float(self._plant.tip[X])):
+            self._plant.step(part)
+            self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
         self._path.append((time, *self._tip().tolist()))
 
     def _round_to_steps(self, command: Control) -> Floats:

@@ -10,13 +10,15 @@ from flexneedle.errors import InputError
 from flexneedle.mechanics.law import tables
 from flexneedle.phantom import rod as rd
 from flexneedle.phantom.draw import Truth
+from flexneedle.phantom.drift import ModulusDrift, scale_moduli
 from flexneedle.phantom.equilibrium import step
+from flexneedle.phantom.tearing import channel_laws, tear
 from flexneedle.plugins import find_part, function_rule, missing_parts, parts_of
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import drive_along_entry
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import STILL, Control, Floats, Z
+from flexneedle.types import STILL, Floats, X, Z
 
 _POISSON = 0.3  # steel and nitinol; GJ = EI/(1 + ν) for a round needle
 _GUIDE_STIFFNESS = 1e3  # N/mm; the force of a needle on its guide is about 1 N
@@ -67,7 +69,11 @@ class ModelPlant:
     def __init__(self, truth: Truth, roll: float) -> None:
         leaves_plane = any((truth.base_z, truth.base_psi, truth.load[1]))
         space = truth.scenario.with_values({"setup.axes": 2}) if leaves_plane else truth.scenario
-        self._simulator = Simulator(space, threads=1)
+        self._simulator, self._drift = Simulator(space, threads=1), ModulusDrift(truth)
+        if truth.yield_mm is not None:
+            torn = tear(self._simulator.model, space.tissue, truth.yield_mm)
+            self._simulator = self._simulator.with_model(torn)
+        self._model = self._simulator.model
         start = self._simulator.start(roll)
         _, y, z, theta, psi = start.base.tolist()
         moved = start.with_estimate(
@@ -80,8 +86,10 @@ class ModelPlant:
 
     def step(self, row: Floats) -> None:
         """Move the needle and cut the tissue."""
-        self._state = self._simulator.step(self._state, Control.of(row.tolist()))
+        self._state, _ = self._simulator.replay(self._state, row[None])
         self._converged &= self._state.converged
+        if self._drift.advance(float(self.tip[X])):
+            self._simulator = self._simulator.with_model(scale_moduli(self._model, self._drift.factor))
 
     @property
     def tip(self) -> Floats:
@@ -137,6 +145,7 @@ class ExactPlant:
         points = math.ceil(2.0 * max(scenario.setup.max_depth, 1.0) / self.rod.spacing) + 8
         self.channel = np.zeros(points, rd.POINT)
         self.count = 0
+        self._drift = ModulusDrift(truth)
         self._converged = True
         self.step(np.array(STILL))
 
@@ -145,6 +154,11 @@ class ExactPlant:
         driven = drive_along_entry(self.scenario, row)
         self.count = step(self.rod, self.state, self.segments, self.channel, self.count, driven)
         self._converged &= bool(self.state["converged"] > 0.0)
+        before = self._drift.factor
+        if self._drift.advance(float(self.state["tip"][X])):
+            change = self._drift.factor / before
+            self.rod.foundation[:] *= change
+            self.channel["stiffness"][: self.count] *= change
 
     @property
     def tip(self) -> Floats:
@@ -196,6 +210,7 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
     middle = (np.arange(cells) + 0.5) * cell
     which = np.searchsorted(np.array(scenario.layer_tops[1:]), middle, side="right")
     laws, place = laws_of(scenario.tissue)
+    torn, torn_place = channel_laws(scenario.tissue, truth.yield_mm)
     modulus, height, width, weight = (
         np.array([getattr(layer, name) for layer in scenario.tissue])[which]
         for name in ("modulus", "compression_length_mm", "engaged_width_mm", "energy_weight")
@@ -216,8 +231,9 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
         rotation_friction=_rotation_friction(scenario),
         spacing=settings.contact_spacing_mm,
         cell=cell,
-        laws=tables(laws),
+        laws=tables([*laws, *torn]),
         law=np.array(place)[which],
+        channel_law=len(laws) + np.array(torn_place)[which],
         height=height,
         foundation=modulus * factor * width / height,
         weight=weight,

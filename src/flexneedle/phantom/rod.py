@@ -125,7 +125,8 @@ class Rod(NamedTuple):
     spacing: float  # spacing of channel points (mm)
     cell: float  # length of the cells of tissue along the depth (mm)
     laws: Floats  # tables of `mechanics.law`
-    law: NDArray[np.int64]  # index of the law of each cell
+    law: NDArray[np.int64]  # index of the law of the bevel's spring in each cell
+    channel_law: NDArray[np.int64]  # index of the law of the channel's points in each cell
     height: Floats  # compression length of each cell (mm)
     foundation: Floats  # initial stiffness (N/mm) of 1 mm of needle in each cell
     weight: Floats  # layer weight of each cell

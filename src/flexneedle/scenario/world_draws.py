@@ -28,6 +28,8 @@ _WITHIN_LEVEL = (0.5, 2.0)
 _SKIN_SHARE = 0.3
 _SKIN_MM, _SKIN_FACTOR = (1.0, 3.0), (2.0, 10.0)
 _FREE_RADIUS_MM = (150.0, 2000.0)
+SKIN = "skin"
+"""Name of a thin, stiff first layer."""
 LARGEST_BEVEL_MM = 5.0
 """Largest bevel offset of a world."""
 
@@ -141,7 +143,7 @@ def _with_skin(rng: np.random.Generator, tissue: list[dict[str, Any]], level: fl
     first, *others = tissue
     if "thickness_mm" in first:
         first = {**first, "thickness_mm": round_value(first["thickness_mm"] - thickness)}
-    return [{"name": "skin", "shear_modulus_kpa": modulus, "thickness_mm": thickness}, first, *others]
+    return [{"name": SKIN, "shear_modulus_kpa": modulus, "thickness_mm": thickness}, first, *others]
 
 
 def _draw_bevel(needle: dict[str, Any], tissue: list[dict[str, Any]], radius: float) -> float:

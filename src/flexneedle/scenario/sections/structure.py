@@ -38,6 +38,12 @@ class Structure(Section):
     """Axial shift of the guide, positive towards the skin."""
     hidden_layer: HiddenLayer | None = None
     """A further layer. Not set: none."""
+    yield_mm: Positive | None = None
+    """Lateral displacement from which the tissue tears: the force saturates. Not set: it does not tear."""
+    spring_back_mm: NonNegative = 0.0
+    """Length by which the needle springs back where its advance stops in tissue; the next advance takes it up."""
+    modulus_drift: Annotated[float, Field(ge=-0.9, le=10)] = 0.0
+    """Relative change of all moduli until the tip reaches the target, linear in the deepest position of the tip."""
 
 
 def structure_problems(needle: Needle, setup: Setup, structure: Structure) -> Iterator[Problem]:
