@@ -25,7 +25,8 @@ def run(capsys, *argv):
 
 
 def test_list_names_the_presets(capsys):
-    listed = "phantom      Two-layer tissue phantom\nphantom3d    Two-layer tissue phantom in space\n"
+    listed = "gel          Stiff gel\n"
+    listed += "phantom      Two-layer tissue phantom\nphantom3d    Two-layer tissue phantom in space\n"
     assert run(capsys, "scenario", "list") == (0, listed, [])
 
 

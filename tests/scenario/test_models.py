@@ -17,12 +17,13 @@ from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.library import PRESETS
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.needle import GAUGES
+from flexneedle.scenario.world_draws import bevel_of_radius
 
 PHANTOM = load_scenario("phantom")
 
 
 def test_the_preset_is_the_two_layer_phantom():
-    assert PRESETS.names() == ["phantom", "phantom3d"]
+    assert PRESETS.names() == ["gel", "phantom", "phantom3d"]
     assert PHANTOM.name == "Two-layer tissue phantom"
     assert [layer.shear_modulus_kpa for layer in PHANTOM.tissue] == [1.82, 3.63]
     assert PHANTOM.setup.guide_to_skin_mm == 41.0
@@ -38,6 +39,20 @@ def test_the_phantom_in_space_is_the_same_with_two_axes_and_a_target_off_both():
         "target.lateral_z_mm": 3.0,
     }
     assert check_tables(load_scenario("phantom3d")) == check_tables(PHANTOM).with_values(changes)
+
+
+def test_the_gel_is_as_recorded_with_the_rig_and_errors_of_the_phantom():
+    """Foundation as of 160 to 680 kPa; the free path of its bevel has a radius of 2 m."""
+    gel = load_scenario("gel")
+    (layer,) = gel.tissue
+    foundation = layer.modulus * layer.engaged_width_mm / layer.compression_length_mm
+    assert 3e-3 * 160.0 * 0.26 < foundation < 3e-3 * 680.0 * 0.26
+    needle, guide = gel.needle, gel.setup.guide_to_skin_mm
+    offset = bevel_of_radius(2000.0, needle.bending_stiffness, foundation, needle.bevel.length_mm)
+    assert needle.bevel.offset_mm == pytest.approx(offset, rel=1e-3)
+    assert (needle.gauge, guide) == ("18G", 20.0)
+    for section in ("contact", "plan", "control", "tracker", "phantom"):
+        assert getattr(check_tables(gel), section) == getattr(check_tables(PHANTOM), section)
 
 
 def test_a_minimal_file_takes_its_settings_from_the_phantom(minimal_text, scenario_file):

@@ -219,7 +219,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(minimal_text, scen
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("phantm", "phantm: no such file, and no such preset (choices: phantom, phantom3d)"),
+        ("phantm", "phantm: no such file, and no such preset (choices: gel, phantom, phantom3d)"),
         ("", '"": is a directory'),
         ("/", "/: is a directory, not a scenario file"),
         ("a\0b", "a\\x00b: cannot be read"),

@@ -18,7 +18,7 @@ DEPTH = "target.depth_mm"
 def test_a_new_client_gets_the_choices_and_the_first_plan(server):
     with Client(server) as client:
         welcome = client.newest["welcome"]
-        assert welcome["presets"] == ["phantom", "phantom3d"]
+        assert welcome["presets"] == ["gel", "phantom", "phantom3d"]
         assert welcome["controllers"][0]["name"] == "adaptive-mpc"
         assert (welcome["strategies"], welcome["rig"]) == (["manipulation", "steering"], None)
         client.has("clients", clients=1, steering=None)
@@ -197,7 +197,7 @@ def test_work_is_started_and_cancelled(client):
 
 
 REFUSED = [
-    ("preset", {"name": "nonsense"}, "preset = nonsense: must be one of phantom, "),
+    ("preset", {"name": "nonsense"}, "preset = nonsense: must be one of gel, phantom, "),
     ("load", {"name": "x", "text": "["}, "x: not TOML: "),
     ("options", {"controller": "nonsense"}, "controller = nonsense: must be one of adaptive-mpc, "),
     ("pace", {"pace": 1.0}, NONE_RUNS),
