@@ -79,8 +79,16 @@ def one_row(index, case, controller, settings, target, own, repeat, factor, seed
         "strain_energy_mj": float(energy),
         "planned_strain_energy_mj": float(planned),
         "planned_error_mm": 0.01,
+        **{
+            f"{of}_energy_uj": 1e3 * float(energy) * part
+            for of, part in (("peak", 1.5), ("mean", 0.5), ("end", 1.0))
+        },
+        "planned_peak_energy_uj": 1e3 * float(planned),
+        "planned_mean_energy_uj": 0.5e3 * float(planned),
+        "energy_scale_uj": 4e3,
         "guide_travel_mm": float(3 + rng.random()),
-        "peak_stretch": 0.8,
+        "planned_guide_travel_mm": 2.0,
+        "least_stretch": 0.8,
         "periods": periods + int(rng.integers(0, 3)),
         "planned_periods": periods,
         "unconverged_periods": 0,

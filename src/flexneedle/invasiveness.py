@@ -88,19 +88,19 @@ class Invasiveness:
     @property
     def energies(self) -> str:
         """Peak, mean and end of the energy as text."""
-        peak, mean, end = map(_format_number, self.energies_uj)
+        peak, mean, end = map(format_number, self.energies_uj)
         return f"peak {peak}, mean {mean}, end {end} µJ"
 
     def rows(self, turns: str = "rolls") -> dict[str, str]:
         """Return the values as text by name, for tables; turns: name for rolls of the bevel."""
         tissue = "estimated tissue" if self.estimated else "tissue"
         energies, relative = (
-            ", ".join(map(_format_number, values)) for values in (self.energies_uj, self.relative_energies)
+            ", ".join(map(format_number, values)) for values in (self.energies_uj, self.relative_energies)
         )
         return {
             f"{tissue} energy: peak, mean, end": f"{energies} µJ",
             "  relative to E₁": relative,
-            f"least stretch of the {tissue}": _format_number(self.least_stretch),
+            f"least stretch of the {tissue}": format_number(self.least_stretch),
             "guide travel in the tissue": f"{self.guide_travel_mm:.2f} mm",
             turns: str(self.rolls),
         }
@@ -109,6 +109,6 @@ class Invasiveness:
         return "; ".join(f"{name.strip()} {text}" for name, text in self.rows().items())
 
 
-def _format_number(value: float) -> str:
-    """Return a number with three significant digits."""
-    return "unknown" if isnan(value) else f"{float(f'{value:.3g}'):g}"
+def format_number(value: float) -> str:
+    """Return a number with three significant digits, "–" if unknown."""
+    return "–" if isnan(value) else f"{float(f'{value:.3g}'):g}"

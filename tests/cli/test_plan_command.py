@@ -5,6 +5,7 @@ import json
 import pytest
 
 from commands import names, run
+from flexneedle.invasiveness import format_number
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 STRATEGIES = ("manipulation", "steering")
@@ -28,6 +29,9 @@ def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp):
     assert status == 0
     assert names(in_tmp / "here") == ["plan.png", "plan.svg", "run.json"]
     assert out.startswith("Plan (manipulation) reaches the target to 0.010 mm\n")
+    result = json.loads((in_tmp / "here/run.json").read_text())["result"]["manipulation"]
+    peak, mean, end = (format_number(result[f"{of}_energy_uj"]) for of in ("peak", "mean", "end"))
+    assert f"{peak}, {mean}, {end} µJ" in out
     assert run(capsys, "view", "here")[:2] == (0, "here/plan.png\nhere/plan.svg\n")
 
 

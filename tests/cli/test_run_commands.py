@@ -15,6 +15,7 @@ from commands import names, run
 from flexneedle.cli import main as cli
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.errors import RunError
+from flexneedle.invasiveness import format_number
 from flexneedle.phantom import kernels
 from flexneedle.record.reader import read_trace
 
@@ -56,6 +57,10 @@ def test_insert_writes_a_record_and_a_table(engine, capsys):
     assert names(Path("here")) == INSERTION_FILES
     assert out.startswith("Reached: the tip ended 0.070 mm from the target\n")
     assert "Record and figures: here" in out
+    result = read("here")["result"]
+    for by in ("", "planned_"):
+        peak, mean, end = (format_number(result[f"{by}{of}_energy_uj"]) for of in ("peak", "mean", "end"))
+        assert f"{peak}, {mean}, {end} µJ" in out
     assert "Planning 100%" in err
     assert "Inserting" in err
     assert "\x1b" not in out + err

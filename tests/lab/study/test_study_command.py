@@ -5,10 +5,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.cli import main as cli
 from flexneedle.cli.progress import Progress
+from flexneedle.invasiveness import format_number
 from flexneedle.lab.commands import study as study_command
 from flexneedle.lab.study import jobs, pools, provenance
 from flexneedle.lab.study.runner import StudyProgress
@@ -50,6 +52,10 @@ def test_a_study_writes_tables_to_a_new_folder_and_prints_one(capsys, here, monk
     assert out.startswith("Mine\n")
     assert re.search(r"^ phantom.tracker_bias_mm 0.3 +4 of 4 +\d\.\d{3} ± \d\.\d{3} ", out, re.MULTILINE)
     assert re.search(r"^ open-loop, all +8 of 8 ", out, re.MULTILINE)
+    rows = pq.read_table(folder / "runs.parquet").to_pandas()
+    peak, mean, end = (format_number(rows[f"{of}_energy_uj"].mean()) for of in ("peak", "mean", "end"))
+    assert re.search(rf"^ open-loop, all +{peak}, {mean}, {end} ", out, re.MULTILINE)
+    assert f" {rows.guide_travel_mm.mean():.1f} ({rows.planned_guide_travel_mm.mean():.1f}) " in out
     assert "8 periods did not converge" in out
     assert out.endswith(f"Tables: runs/{folder.name}\n")
     assert re.search(r"^Inserting 100%: 8 of 8, [\d.]+/s, 0 s left$", err, re.MULTILINE)

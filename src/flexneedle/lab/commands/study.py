@@ -186,16 +186,19 @@ def _report(folder: Path, as_json: bool, seconds: float) -> int:
 
 
 def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
-    heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
+    heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "periods")
+    load_heads = ("", "energy (µJ)", "over planned", "over E₁", "stretch", "travel", "flips")
     varied = [factor.key for factor in found.design.factors if factor.varies]
     pooled = found.whole if len(found.groups) > len(found.whole) else ()
     rows = [(_label(group.levels, varied) or group.name, group) for group in found.groups]
     rows += [(f"{group.name}, all", group) for group in pooled]
     unconverged = sum(group.unconverged_periods for group in found.whole)
     print_table(found.study.title, heads, ((name, *_format_cells(group)) for name, group in rows))
+    print("Finished insertions: true error (mm); largest number of periods, relative to the plan.\n")
+    print_table("Load on the tissue", load_heads, ((name, *_format_load(group)) for name, group in rows))
     print(
-        "Finished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
-        "periods, relative to the plan."
+        "Means over finished insertions: peak, mean and end of the tissue energy; least stretch; guide travel in the "
+        "tissue (mm) and flips (planned)."
     )
     if unconverged:
         print(f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet.")
@@ -216,9 +219,24 @@ def _format_cells(group: SettingGroup) -> Sequence[str]:
         f"{group.finished} of {group.count}",
         f"{_number(value['mean_mm'])} ± {_number(value['sd_mm'])}",
         *map(_number, (value["median_mm"], value["p95_mm"], group.largest_mm)),
-        f"{_number(value['flips'], 1)} ({_number(value['planned_flips'], 1)})",
-        _number(value["energy_ratio"], 2),
         _number(group.largest_period_ratio, 2),
+    )
+
+
+def _format_load(group: SettingGroup) -> Sequence[str]:
+    from flexneedle.invasiveness import format_number
+    from flexneedle.lab.study.findings.groups import ENERGIES
+
+    value = {name: estimate.value for name, estimate in group.estimates.items()}
+    energies = (
+        ", ".join(format_number(value[f"{of}_energy_{kind}"]) for of in ENERGIES)
+        for kind in ("uj", "ratio", "relative")
+    )
+    return (
+        *energies,
+        _number(value["least_stretch"]),
+        f"{_number(value['guide_travel_mm'], 1)} ({_number(value['planned_guide_travel_mm'], 1)})",
+        f"{_number(value['flips'], 1)} ({_number(value['planned_flips'], 1)})",
     )
 
 

@@ -37,6 +37,13 @@ def test_the_statistics_of_a_group_agree_with_hand_values(read):
     for row, error in zip(rows, (0.1, 0.2, 0.3, 0.4, 2.0), strict=True):
         row |= {"true_error_mm": error, "strain_energy_mj": 3.0, "planned_strain_energy_mj": 2.0}
         row |= {
+            "peak_energy_uj": 8e3,
+            "planned_peak_energy_uj": 2e3,
+            "mean_energy_uj": 1e3,
+            "energy_scale_uj": 5e3,
+        }
+        row |= {"planned_mean_energy_uj": 4e3, "guide_travel_mm": 6.0, "least_stretch": 0.7}
+        row |= {
             "periods": 60,
             "planned_periods": 50,
             "flips": 2,
@@ -51,8 +58,12 @@ def test_the_statistics_of_a_group_agree_with_hand_values(read):
     assert (group.unconverged, group.largest_mm, group.largest_period_ratio) == (1, 2.0, 1.5)
     expected = {
         "mean_mm": 0.6, "sd_mm": np.std([0.1, 0.2, 0.3, 0.4, 2.0], ddof=1), "median_mm": 0.3, "p95_mm": 1.68,
-        "residual_mm": 0.7, "flips": 2.0, "planned_flips": 1.0, "energy_mj": 3.0, "planned_energy_mj": 2.0,
-        "energy_ratio": 1.5, "period_ratio": 63 / 50,
+        "residual_mm": 0.7, "flips": 2.0, "planned_flips": 1.0, "period_ratio": 63 / 50,
+        "peak_energy_uj": 8e3, "mean_energy_uj": 1e3, "end_energy_uj": 3e3,
+        "planned_peak_energy_uj": 2e3, "planned_mean_energy_uj": 4e3, "planned_end_energy_uj": 2e3,
+        "peak_energy_ratio": 4.0, "mean_energy_ratio": 0.25, "end_energy_ratio": 1.5,
+        "peak_energy_relative": 1.6, "mean_energy_relative": 0.2, "end_energy_relative": 0.6,
+        "least_stretch": 0.7, "guide_travel_mm": 6.0, "planned_guide_travel_mm": 2.0,
     }  # fmt: skip
     assert value == pytest.approx(expected, rel=1e-12)
 

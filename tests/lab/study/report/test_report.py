@@ -177,15 +177,32 @@ def test_effort_is_reported_relative_to_the_plan(report_on):
     for row in rows:
         row |= {"flips": 3, "planned_flips": 1, "periods": 66, "planned_periods": 60}
         row |= {"strain_energy_mj": 0.006, "planned_strain_energy_mj": 0.005, "unconverged_periods": 0}
+        row |= {"peak_energy_uj": 9.0, "planned_peak_energy_uj": 6.0, "guide_travel_mm": 3.0}
     rows[0] |= {"unconverged_periods": 2, "periods": 72}
     rows[1] |= {"unconverged_periods": 5}
     report, page = report_on(rows)
     head = page.text[: page.text.index("Figures")]
     assert "bevel flips 3.00 planned 1.00" in head
-    assert "tissue energy / planned 1.20 1.20 to 1.20" in head
+    assert "peak tissue energy / planned 1.50 1.50 to 1.50" in head
+    assert "end tissue energy / planned 1.20 1.20 to 1.20" in head
+    assert "guide travel 3.00 mm planned 2.00 mm" in head
     assert "periods / planned 1.11 largest 1.20" in head
     assert "periods not converged 7 in 2 insertions" in head
     assert report.values()["groups"][0]["unconverged_periods"] == 7
+
+
+def test_a_study_of_an_earlier_version_has_the_energy_at_the_end_alone(report_on):
+    """The columns of peak, mean, scale and stretch are missing, not the report."""
+    new = re.compile("energy_uj|energy_scale|least_stretch|planned_guide")
+    rows = [
+        {k: v for k, v in row.items() if not new.search(k)} for row in make_rows(targets=TARGETS, repeats=4)
+    ]
+    for row in rows:
+        row |= {"strain_energy_mj": 0.006, "planned_strain_energy_mj": 0.005}
+    report, page = report_on(rows)
+    assert "end tissue energy / planned 1.20" in page.text
+    assert "peak tissue energy / planned –" in page.text
+    assert report.values()["groups"][0]["estimates"]["end_energy_uj"]["value"] == pytest.approx(6.0)
 
 
 def test_the_headline_includes_failures_and_misses_of_all_settings(report_on):

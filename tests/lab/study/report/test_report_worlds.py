@@ -62,6 +62,11 @@ def row_of(study, index, bounded):
         **predicted(point, error),
         "strain_energy_mj": 2.0 ** (point.world % 3),
         "planned_strain_energy_mj": 1.0,
+        "peak_energy_uj": 3.0 ** (point.world % 3),
+        "planned_peak_energy_uj": 0.5,
+        "energy_scale_uj": 9.0,
+        "guide_travel_mm": float(point.world),
+        "planned_guide_travel_mm": 2.0,
         "unconverged_periods": 0,
         "reach_mm": REACH[point.world] if bounded else None,
         "outcome": "done" if error is not None else "held",
@@ -117,13 +122,19 @@ def test_groups_are_controllers_cases_and_whether_there_is_a_guide(report):
 
 
 def test_errors_shares_and_energy_are_over_finished_insertions(report):
-    """Errors 0.02, 0.5 and 1.6 mm; 2, 4 and 1 times the planned energy in worlds 1, 2, 3."""
+    """Errors 0.02, 0.5 and 1.6 mm; 2, 4 and 1 times the planned energy at the end in worlds 1, 2, 3.
+
+    At the peak 6, 18 and 2 times, and 1/3, 1 and 1/9 E₁.
+    """
     guided, free = (group(report, DEFAULT, "perfect", guide) for guide in ("with a guide", "no guide"))
     errors = [0.02, 0.5, 1.6]
     assert (guided.count, guided.finished) == (4, 3)
     expected = [np.median(errors), np.mean(errors), *np.quantile(errors, (0.95, 0.99)), 1.6, 1 / 3, 2.0]
     measured = (guided.median_mm, guided.mean_mm, guided.p95_mm, guided.p99_mm, guided.max_mm, guided.above)
-    assert_allclose((*measured, guided.energy_ratio), expected)
+    assert_allclose((*measured, guided.end_energy_ratio), expected)
+    assert_allclose((guided.peak_energy_ratio, guided.peak_energy_relative), (6.0, 1.0 / 3.0))
+    assert np.isnan(guided.mean_energy_ratio)
+    assert (guided.guide_travel_mm, guided.planned_guide_travel_mm) == (2.0, 2.0)
     assert_allclose(guided.within_twice_open_loop, 2 / 3)  # 0.02 ≤ 0.1, 0.5 > 0.4, 1.6 ≤ 3.0
     assert_allclose(guided.within_open_loop, 2 / 3)  # 0.02 ≤ 0.21, 0.5 > 0.4, 1.6 ≤ 1.7
     assert_allclose(guided.within_reach, 2 / 3)  # 0.02 and 0.5 ≤ 0.5, 1.6 above
@@ -166,7 +177,7 @@ def test_the_page_has_the_table_and_the_figure(report):
     assert cells[:4] == ["4", "3", "1", "0.500"]
     assert report.values()["worlds"][0]["levels"]["controller"] == DEFAULT
     tables = Page(report.page).tables
-    for start in ("Errors, shares and energy", "Finished insertions. Covered"):
+    for start in ("Errors, shares, energy", "Finished insertions. Covered"):
         (found,) = (table for caption, table in tables.items() if caption.startswith(start))
         assert len(found.labels) > 0
         assert all(labels == found.headings for labels in found.labels)

@@ -21,6 +21,7 @@ from flexneedle.lab.study.findings.statistics import (
 )
 
 DONE = "done"
+ENERGIES = ("peak", "mean", "end")
 HIT_MM = 1.0  # radius of the paper's target circles
 _MOST_DEPTHS, _DEPTH_BANDS = 8, 5
 _NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
@@ -134,7 +135,7 @@ def _estimate_group(rows: InsertionRows, ended: Codes, seeds: Codes) -> dict[str
         return rows.number(name)[ended]
 
     error = column("true_error_mm")
-    energy, planned_energy = column("strain_energy_mj"), column("planned_strain_energy_mj")
+    loads = {name: values[ended] for name, values in find_loads(rows).items()}
     statistics = {
         "mean_mm": mean(error),
         "sd_mm": sd(error),
@@ -143,12 +144,34 @@ def _estimate_group(rows: InsertionRows, ended: Codes, seeds: Codes) -> dict[str
         "residual_mm": mean(column("residual_mm")),
         "flips": mean(column("flips")),
         "planned_flips": mean(column("planned_flips")),
-        "energy_mj": mean(energy),
-        "planned_energy_mj": mean(planned_energy),
-        "energy_ratio": ratio(energy, planned_energy),
+        **{name: mean(values) for name, values in loads.items()},
+        **{
+            f"{of}_energy_ratio": ratio(loads[f"{of}_energy_uj"], loads[f"planned_{of}_energy_uj"])
+            for of in ENERGIES
+        },
+        **{
+            name: mean(column(name))
+            for name in ("least_stretch", "guide_travel_mm", "planned_guide_travel_mm")
+        },
         "period_ratio": ratio(column("periods"), column("planned_periods")),
     }
     return estimate_all(statistics, _renumber(seeds))
+
+
+def find_loads(rows: InsertionRows) -> dict[str, Floats]:
+    """Return energies of the true tissue (n,) by name: peak, mean and end, the plan's, and relative to E₁.
+
+    NaN in tables of versions without them, which have the energy at the end alone.
+    """
+    scale, found = rows.number("energy_scale_uj"), dict[str, Floats]()
+    for of in ENERGIES:
+        energy, planned = (
+            1e3 * rows.number(f"{by}strain_energy_mj") if of == "end" else rows.number(f"{by}{of}_energy_uj")
+            for by in ("", "planned_")
+        )
+        found |= {f"{of}_energy_uj": energy, f"planned_{of}_energy_uj": planned}
+        found[f"{of}_energy_relative"] = divide_positive(energy, scale)
+    return found
 
 
 def compare_controllers(rows: InsertionRows, design: StudyDesign) -> list[Difference]:

@@ -9,9 +9,11 @@ import numpy as np
 
 from flexneedle.lab.study.findings.design import StudyDesign
 from flexneedle.lab.study.findings.groups import (
+    ENERGIES,
     HIT_MM,
     divide_positive,
     find_finished,
+    find_loads,
     number_pairs,
     split_rows,
 )
@@ -33,7 +35,8 @@ class WorldGroup:
     1 mm, or was held although its reach is at most `control.miss_limit_mm`.
     Shares (0 to 1): above 1 mm; within max(0.1 mm, 2 × error of open loop in the same world), and within that error
     + 0.2 mm, if open loop finished; within the reach + 0.5 mm, if the reach is known.
-    energy_ratio: geometric mean of the energy of the true tissue relative to the plan. NaN: unknown.
+    …_energy_ratio, …_energy_relative: geometric means of peak, mean and end of the energy of the true tissue, relative
+    to the plan and to E₁; travel of the guide in the tissue (mm): means. NaN: unknown.
     """
 
     levels: dict[str, str]
@@ -49,7 +52,14 @@ class WorldGroup:
     within_twice_open_loop: float
     within_open_loop: float
     within_reach: float
-    energy_ratio: float
+    peak_energy_ratio: float
+    mean_energy_ratio: float
+    end_energy_ratio: float
+    peak_energy_relative: float
+    mean_energy_relative: float
+    end_energy_relative: float
+    guide_travel_mm: float
+    planned_guide_travel_mm: float
 
 
 def has_worlds(rows: InsertionRows) -> bool:
@@ -63,15 +73,15 @@ def group_worlds(rows: InsertionRows, design: StudyDesign) -> list[WorldGroup]:
         return []
     error = np.where(find_finished(rows), rows.number("true_error_mm"), nan)
     columns = np.stack(
-        [error, _find_open_loop(rows, design, error), rows.number("reach_mm"), _divide_energies(rows)]
+        [error, _find_open_loop(rows, design, error), rows.number("reach_mm"), *_find_loads(rows)]
     )
     failed = find_failures(rows)
     return [_make_group(levels, columns[:, own], failed[own]) for levels, own in split_rows(design.factors)]
 
 
 def _make_group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup:
-    """Return the group of columns (4, n): error, error of open loop, reach, energy ratio."""
-    error, open_loop, reach, energy = columns[:, ~np.isnan(columns[0])]
+    """Return the group of columns (11, n): error, error of open loop, reach, and `_find_loads`."""
+    error, open_loop, reach, *loads = columns[:, ~np.isnan(columns[0])]
     share = (0.5, 0.95, 0.99, 1.0)
     median, p95, p99, largest = np.quantile(error, share).tolist() if len(error) else [nan] * 4
     return WorldGroup(
@@ -88,7 +98,8 @@ def _make_group(levels: dict[str, str], columns: Floats, failed: Flags) -> World
         _share_within(error, np.maximum(LEAST_MM, TWICE * open_loop)),
         _share_within(error, open_loop + WORSE_MM),
         _share_within(error, reach + BEYOND_REACH_MM),
-        float(np.exp(average(np.log(energy[energy > 0.0])))),
+        *(float(np.exp(average(np.log(energy[energy > 0.0])))) for energy in loads[:-2]),
+        *(average(travel[~np.isnan(travel)]) for travel in loads[-2:]),
     )
 
 
@@ -130,5 +141,9 @@ def find_failures(rows: InsertionRows) -> Flags:
     return np.array([is_failure(dict(zip(names, row, strict=True))) for row in found], dtype=bool)
 
 
-def _divide_energies(rows: InsertionRows) -> Floats:
-    return divide_positive(rows.number("strain_energy_mj"), rows.number("planned_strain_energy_mj"))
+def _find_loads(rows: InsertionRows) -> list[Floats]:
+    """Return peak, mean and end of the energy (n,) relative to the plan, then to E₁; guide travel, planned travel."""
+    found = find_loads(rows)
+    ratios = [divide_positive(found[f"{of}_energy_uj"], found[f"planned_{of}_energy_uj"]) for of in ENERGIES]
+    relative = [found[f"{of}_energy_relative"] for of in ENERGIES]
+    return [*ratios, *relative, rows.number("guide_travel_mm"), rows.number("planned_guide_travel_mm")]

@@ -10,6 +10,7 @@ from itertools import cycle
 from math import isnan
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.invasiveness import format_number
 from flexneedle.lab.study.findings import groups, predictions, statistics, worlds
 from flexneedle.lab.study.findings.findings import Findings
 from flexneedle.lab.study.findings.rows import InsertionRows
@@ -54,7 +55,8 @@ def _compile_template() -> "Template":
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {
-        "number": format_number,
+        "number": format_decimals,
+        "digits": format_number,
         "signed": format_signed,
         "interval": format_interval,
         "value": format_value,
@@ -64,7 +66,7 @@ def _compile_template() -> "Template":
     return environment.from_string((_TEMPLATES / "report.html.jinja").read_text(encoding="utf-8"))
 
 
-def format_number(value: float, digits: int = 3, unit: str = "") -> str:
+def format_decimals(value: float, digits: int = 3, unit: str = "") -> str:
     """Return a number as text, "–" if unknown."""
     return "–" if isnan(value) else f"{value:.{digits}f}{unit}"
 
