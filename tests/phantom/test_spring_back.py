@@ -48,8 +48,8 @@ def test_without_play_or_outside_of_the_tissue_the_base_follows_the_driver():
     assert advances(SpringBack(0.5), 1.0, 0.0, 1.0, depth=-3.0) == [1.0, 0.0, 1.0]
 
 
-def test_near_the_skin_the_tip_stays_in_the_tissue():
-    assert advances(SpringBack(0.5), 1.0, 0.0, depth=0.4) == [1.0, -0.2, 0.0]
+def test_near_the_skin_the_play_is_a_tenth_of_the_depth():
+    assert advances(SpringBack(0.5), 1.0, 0.0, depth=4.0) == pytest.approx([1.0, -0.4, 0.0])
 
 
 @both_plants

@@ -6,11 +6,13 @@ import numpy as np
 
 from flexneedle.types import DB_X, STILL, Floats
 
+_SHARE_OF_DEPTH = 0.1
+
 
 class SpringBack:
     """Play between driver and base: while the needle advances, the base follows the driver; else it is `most` mm short.
 
-    Near the skin the play is half of the depth at most, so the tip does not leave the tissue.
+    The play is a tenth of the depth at most, since the force that pushes back grows with the inserted length.
     """
 
     def __init__(self, most: float) -> None:
@@ -23,7 +25,7 @@ class SpringBack:
             yield _along_axis(self._play)
             self._play = 0.0
         elif self._advancing and not advances:
-            self._play = min(self._most, 0.5 * max(0.0, depth))
+            self._play = min(self._most, _SHARE_OF_DEPTH * max(0.0, depth))
             if self._play > 0.0:
                 yield _along_axis(-self._play)
         self._advancing = advances
