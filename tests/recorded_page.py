@@ -165,10 +165,15 @@ def reach_frame():
     return shape(FrameKind.REACH, FrameSource.SCENE, 0, *outlines)
 
 
+def load(energies, rolls):
+    """Return the load of a plan or an insertion, as text by name."""
+    return {"tissue energy: peak, mean, end": f"{energies} µJ", "rolls": str(rolls)}
+
+
 def plan(strategy="manipulation", **changes):
     given = {
         "revision": 1, "reached": True, "summary": "ends 0.001 mm off", "error_mm": 0.001,
-        "energy_mj": 0.0021, "flips": 0, "roll_deg": 0.0, "cost": 0.19,
+        "load": load("3.2, 1.1, 2.1", 0), "roll_deg": 0.0, "cost": 0.19,
         "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
         "seconds": 0.3, **changes,
     }  # fmt: skip
@@ -189,7 +194,7 @@ def row(index):
         "measured": (x + 0.05 * np.sin(index), y + 0.1 * np.cos(7 * index), z + 0.1 * np.sin(5 * index)),
         "estimate": (x, y, z), "true": tuple(true), "error_mm": float(np.hypot(*(true[1:] - (y, z)))),
         "guide": (0.02 * index, 0.01 * index), "roll_deg": 3.0 * index, "indicator": 0.1,
-        "energy_mj": 2e-5 * index, "true_energy_mj": 2.1e-5 * index,
+        "energy_uj": 0.02 * index, "true_energy_uj": 0.021 * index,
         "miss_mm": (0.3 * (1 - index / PERIODS), -0.1), "miss_sd_mm": 0.5 * (1 - index / PERIODS) + 0.05,
         "decide_ms": 12.0, "late": False, "warning": "",
     }  # fmt: skip
@@ -270,7 +275,12 @@ def planned():
         plan(),
         *plan_frames(),
         plan(
-            "steering", reached=False, error_mm=2.1, cost=4.2, flips=2, terms={"accuracy": 4.0, "flips": 0.2}
+            "steering",
+            reached=False,
+            error_mm=2.1,
+            cost=4.2,
+            load=load("9, 4, 9", 2),
+            terms={"accuracy": 4.0, "flips": 0.2},
         ),
         *plan_frames(FrameSource.STEERING, sway=-1.5),
         reach_frame(),

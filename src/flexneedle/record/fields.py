@@ -184,7 +184,7 @@ FIELDS: dict[str, PeriodField] = {
     "strain_energy": PeriodField(
         _numbers("strain_energy_mj"),
         topics=(Topic("/tissue/strain_energy", _NUMBER, lambda one: number(one.strain_energy * 1e-3)),),
-        page=("energy_mj",),
+        page=("energy_uj", lambda one, _: 1e3 * one.strain_energy),
     ),
     "tip_load": PeriodField(
         _numbers("tip_load_y_n", "tip_load_z_n"),
@@ -224,7 +224,10 @@ FIELDS: dict[str, PeriodField] = {
                 lambda one: None if one.true_strain_energy is None else number(one.true_strain_energy * 1e-3),
             ),
         ),
-        page=("true_energy_mj",),
+        page=(
+            "true_energy_uj",
+            lambda one, _: None if one.true_strain_energy is None else 1e3 * one.true_strain_energy,
+        ),
     ),
     "stretch": PeriodField(_numbers("stretch")),
     "true_stretch": PeriodField(_numbers("true_stretch")),

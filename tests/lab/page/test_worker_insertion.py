@@ -70,6 +70,7 @@ def test_states_and_frames_are_reported_in_order(inserted, expected):
     last = reported.of("insertion")[-1]
     assert (last.summary, last.error_mm, last.periods) == (expected.summary, expected.error_mm, count)
     assert last.target == short().target.position
+    assert [one.load for one in reported.of("insertion")] == [{}, {}, expected.invasiveness.rows()]
     for kind in (FrameKind.NEEDLE, FrameKind.TRUE, FrameKind.PREDICTED):
         assert [frame.number for frame in reported.shapes(kind, FrameSource.LIVE)] == list(range(count))
     decided = {frame.number for frame in reported.shapes(FrameKind.SAMPLES, FrameSource.LIVE)}
@@ -239,11 +240,11 @@ def test_a_record_has_the_first_disturbances_with_their_times_and_counts_the_oth
 
 
 def test_a_stiffer_layer_stores_more_energy_for_the_same_needle(expected):
-    energy = expected.periods[-1].true_strain_energy
+    energy = 1e3 * expected.periods[-1].true_strain_energy
     rows = disturbed({"what": "stiffen", "size": 3.0, "layer": 0}).rows
-    assert rows[-1]["true_energy_mj"] > 1.3 * energy
+    assert rows[-1]["true_energy_uj"] > 1.3 * energy
     deep = disturbed({"what": "stiffen", "size": 3.0, "layer": 1}).rows  # which the needle does not reach
-    assert deep[-1]["true_energy_mj"] == energy
+    assert deep[-1]["true_energy_uj"] == energy
 
 
 def test_a_layer_is_stiffened_between_its_true_boundaries(monkeypatch):

@@ -108,6 +108,7 @@ def test_a_plan_is_equal_to_the_command_and_reports_each_iteration(strategy, mon
     (message,) = reported.of("plan")
     assert (message.error_mm, message.cost, message.terms) == (made.error_mm, made.cost, made.terms)
     assert message.roll_deg == math.degrees(made.roll)
+    assert message.load == made.invasiveness.rows()
     iterations = reported.of("iteration")
     assert [one.iteration for one in iterations] == list(range(1, len(iterations) + 1))
     source = FrameSource[strategy.upper()]

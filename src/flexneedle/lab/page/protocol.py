@@ -178,7 +178,7 @@ class PlanMessage(ServerMessage):
     """A complete plan. Its needles are a frame SWEEP, the tip's path a frame PATH.
 
     roll_deg: of the bevel's direction at the start, about x from y to z; terms: weighted terms of the cost by name;
-    target_name: "" without other targets.
+    load: rows of `Invasiveness`; target_name: "" without other targets.
     """
 
     by = "strategy"
@@ -189,8 +189,7 @@ class PlanMessage(ServerMessage):
     reached: bool
     summary: str
     error_mm: float
-    energy_mj: float
-    flips: int
+    load: dict[str, str]
     roll_deg: float
     cost: float
     terms: dict[str, float]
@@ -236,6 +235,7 @@ class InsertionMessage(ServerMessage):
             (before it begins) and holding.
         rig: Name of the rig, "" for a virtual one.
         folder: Name of the run that records it, "" without one.
+        load: Rows of `Invasiveness` of an insertion that ended, or none.
         row: Row of a study that was computed again and can be saved as a run.
         target_name: Name of the target, "" without other targets. moved: Whether a retraction has begun since.
     """
@@ -253,6 +253,7 @@ class InsertionMessage(ServerMessage):
     periods: int
     pace: float
     error_mm: float | None = None
+    load: dict[str, str] = {}
     rig: str = ""
     folder: str = ""
     row: int | None = None

@@ -7,7 +7,7 @@ import pytest
 from browser_checks import BAR, FOCUSED, arrived, click_button
 from fake_page import until
 from flexneedle.lab.page.protocol import DisturbancesMessage, RowsMessage
-from recorded_page import clients, insertion, opening, row, rows, session
+from recorded_page import clients, insertion, load, opening, row, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -193,3 +193,14 @@ def test_decisions_of_a_recording_have_its_name(decided, server):
     server.send(insertion("done", of="first", periods=5, name="mine"), rows(0, 5, "first"))
     whose.wait_for()
     assert whose.inner_text() == "Decisions of mine, which is shown:"
+
+
+def test_insertions_that_ended_are_compared_by_their_load(panel, server):
+    """One column for each, and none for one that runs."""
+    page = panel([*opening(), insertion("running", periods=3), rows(0, 3)])
+    assert not page.query_selector(".load")
+    server.send(insertion("done", periods=3, load=load("3.2, 1.1, 2.1", 1)))
+    server.send(insertion("done", of="second", name="other", controller="open-loop", load=load("9, 4, 9", 0)))
+    page.wait_for_selector(".load >> text=other, open-loop")
+    cells = [each.inner_text() for each in page.query_selector_all(".load td.number")]
+    assert cells == ["3.2, 1.1, 2.1 µJ", "9, 4, 9 µJ", "1", "0"]

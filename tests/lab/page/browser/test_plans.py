@@ -144,7 +144,8 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
     assert cells["Cost: accuracy"] == ["0.020", "4.000"]
     assert cells["Cost: energy"] == ["0.120", "–"]
     assert cells["Cost"] == ["0.190", "4.200"]
-    assert cells["Flips (half-turns of the bevel)"] == ["0", "2"]
+    assert cells["rolls"] == ["0", "2"]
+    assert cells["tissue energy: peak, mean, end"] == ["3.2, 1.1, 2.1 µJ", "9, 4, 9 µJ"]
     page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLANS} .sweeps figcaption:has-text('steering, lateral ×')")
     assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2

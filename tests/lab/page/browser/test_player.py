@@ -191,7 +191,7 @@ def test_plots_follow_the_player_choose_its_period_and_grow(player, server):
         "Predicted miss at the target (mm) at 4.0 s: miss 0.236, + 2 standard deviations 1.051, "
         "− 2 standard deviations 0.000"
     )
-    labelled("Tissue energy (mJ) at 4.0 s: estimated 0.000, true 0.000")
+    labelled("Tissue energy (µJ) at 4.0 s: estimated 0.400, true 0.420")
     guide = page.locator(f"{PLOTS} figure", has_text="Guide").locator(".swatch")
     assert [each.get_attribute("style") for each in guide.all()] == ["color: var(--guide);"] * 2
     page.evaluate("flexneedle.store.set('view period', 0)")

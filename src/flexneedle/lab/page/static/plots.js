@@ -24,9 +24,9 @@ const PLOTS = [
     { name: "z", tone: "--guide", of: (row) => row.guide[1], dash: true },
   ] },
   { title: "Roll (°)", lines: [{ name: "roll", tone: "--needle", of: (row) => row.roll_deg }] },
-  { title: "Tissue energy (mJ)", lines: [
-    { name: "estimated", tone: "--estimate", of: (row) => row.energy_mj },
-    { name: "true", tone: "--true", of: (row) => row.true_energy_mj, dash: true },
+  { title: "Tissue energy (µJ)", lines: [
+    { name: "estimated", tone: "--estimate", of: (row) => row.energy_uj },
+    { name: "true", tone: "--true", of: (row) => row.true_energy_uj, dash: true },
   ] },
   {
     title: "Tracker's largest indicator of distortion", none: "This tracker has no indicator.",

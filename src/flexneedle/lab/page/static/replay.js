@@ -6,6 +6,7 @@ import { unpacked } from "./frames.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { inWords } from "./insertion/words.js";
 import { layOut } from "./layout.js";
+import { loadTable } from "./load.js";
 import { mount as mountPlayer } from "./player.js";
 import { mount as mountPlots } from "./plots.js";
 import { mount as mountSection } from "./section.js";
@@ -47,6 +48,6 @@ function mountWords(element) {
     if (run) element.append(make("p", {}, make("strong", {}, `${what}${run.name}.`), ` ${inWords(run)}`));
   }
   const decisions = make("div.decisions");
-  element.append(decisions);
+  element.append(...loadTable(Object.keys(RUNS).map((of) => store.get(`insertion ${of}`))), decisions);
   followDecisions(decisions, store);
 }

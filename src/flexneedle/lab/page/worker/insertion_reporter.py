@@ -57,6 +57,7 @@ class InsertionReporter:
                 periods=self.periods,
                 pace=self.task.control.pace if running else 0.0,
                 error_mm=error,
+                load={} if ended is None else ended.invasiveness.rows(),
                 rig=self.rig or order.rig,
                 folder=self.folder,
                 target_name=order.target_name,

@@ -56,6 +56,7 @@ def describe_recording(
         periods=len(insertion.periods),
         pace=0.0,
         error_mm=error if error == error else None,
+        load=insertion.invasiveness.rows(),
         rig=insertion.rig,
         row=row,
         scene=describe_scene(scenario_of(insertion), 0),

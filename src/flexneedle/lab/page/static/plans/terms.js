@@ -1,11 +1,10 @@
-// Table of plans: the end of each, and the weighted terms of its cost.
+// Table of plans: the weighted terms of the cost of each, its end, and its load on the tissue.
 
 import { make, shown } from "../dom.js";
+import { loadRows } from "../load.js";
 
 const ROWS = [
   ["Error at the target (mm)", ({ error_mm: error }) => shown(error, 3)],
-  ["Tissue energy (mJ)", ({ energy_mj: energy }) => shown(energy, 4)],
-  ["Flips (half-turns of the bevel)", ({ flips }) => String(flips)],
   ["Planning time (s)", ({ seconds }) => shown(seconds, 2)],
 ];
 
@@ -18,7 +17,7 @@ export function termsTable(plans) {
   const terms = names.map((name) => row(`Cost: ${name}`, ({ terms }) => barOf(terms[name], most)));
   const head = make("tr", {}, make("td"), ...plans.map(({ strategy }) => make("th.number", { scope: "col" }, strategy)));
   const caption = make("caption.spoken", {}, "Plans and the terms of their cost");
-  return [make("table", {}, caption, make("thead", {}, head), make("tbody", {}, ...terms, row("Cost", ({ cost }) => shown(cost, 3)), ...ROWS.map((each) => row(...each))))];
+  return [make("table", {}, caption, make("thead", {}, head), make("tbody", {}, ...terms, row("Cost", ({ cost }) => shown(cost, 3)), ...ROWS.map((each) => row(...each)), ...loadRows(plans.map(({ load }) => load))))];
 }
 
 // A number with a bar of that length.
