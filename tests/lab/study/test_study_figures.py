@@ -12,6 +12,7 @@ from drawn import lines, overlapping, texts
 from flexneedle.figures.layout import look
 from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
 from flexneedle.lab.study.figures.distributions import draw_errors
+from flexneedle.lab.study.figures.front import FrontSample, draw_front
 from flexneedle.lab.study.figures.panels import Panel
 from flexneedle.lab.study.figures.samples import ErrorSample
 from flexneedle.lab.study.figures.shares import draw_shares
@@ -49,6 +50,14 @@ def samples(count=150):
     return [sample(name, k, 0.05 * (k + 1), count, k == 2, k) for k, name in enumerate(NAMES)]
 
 
+def fronts(count=50):
+    made = enumerate(NAMES)
+    return [
+        FrontSample(name, look(k), *(lognormal(0.05 * (k + 1), count, s + k) for s in (0, 9)))
+        for k, name in made
+    ]
+
+
 def by_controller(rows):
     return draw_errors([Panel("", "", "#000000", rows)], "")
 
@@ -83,6 +92,7 @@ FIGURES = {
     "sweep, all": lambda: draw_sweep(sweeps(7, missing=2), "mismatch", PLACES),
     "sweep, close": lambda: draw_sweep(sweeps(1, CLOSE, 40), "mismatch", np.linspace(0, 1, 20)),
     "shares, three": lambda: draw_shares([panel(k, samples(), "150 worlds") for k in range(3)]),
+    "front, three": lambda: draw_front([panel(k, fronts(), "150 insertions") for k in range(3)]),
     "differences, all": lambda: draw_differences(difference_panels(7, 5), "more error (mm)"),
 }
 
@@ -214,6 +224,19 @@ def test_a_line_of_shares_has_steps_at_the_errors_and_lacks_unfinished_insertion
     assert line.get_drawstyle() == "steps-post"
     (ax,) = draw_shares([Panel("real", "4 worlds", "#000000", [replace(row, errors=np.empty(0))])]).axes
     assert lines(ax, "a")[0].get_ydata().tolist() == [0.0]
+
+
+def test_the_front_has_a_dot_for_each_insertion_and_a_mark_at_the_medians():
+    one = FrontSample("a", look(2), np.array([0.1, 0.0, 0.4]), np.array([3.0, 1.0, 2.0]))
+    (ax,) = draw_front([Panel("real", "", "#000000", [one])]).axes
+    (found,) = ax.collections
+    assert_allclose(
+        found.get_offsets(), [[3.0, 0.1], [1.0, 0.001], [2.0, 0.4]]
+    )  # an error of 0 at the least drawn
+    (mark,) = lines(ax, "a")
+    assert_allclose(mark.get_xydata(), [[2.0, 0.1]])
+    across, along = lines(ax, "quartiles")
+    assert_allclose((across.get_xdata(), along.get_ydata()), [[1.5, 2.5], [0.0505, 0.25]])
 
 
 SURE, UNSURE = "mean with 95 % interval", "not separable from no difference"

@@ -107,7 +107,7 @@ def test_figures_in_the_page_are_those_in_the_folder(plain, monkeypatch):
     ("options", "more"),
     [
         ({}, []),
-        ({"controllers": BOTH}, ["controllers"]),
+        ({"controllers": BOTH}, ["front", "controllers"]),
         ({"axes": AXES}, ["error-along-1", "error-along-2"]),
         ({"cases": CASES}, ["cases"]),
         ({"targets": TARGETS[:1]}, []),
@@ -117,7 +117,7 @@ def test_figures_are_those_that_the_rows_support(sketched_on, options, more):
     rows = make_rows(**{"targets": TARGETS, "repeats": 3} | options)
     report, _ = sketched_on(rows, axes=options.get("axes", {}))
     drawn = {one.name: one for one in report.figures}
-    assert list(drawn) == ["targeting", "errors-by-depth", *more]
+    assert sorted(drawn) == sorted(["targeting", "errors-by-depth", *more])
     pooled = drawn["errors-by-depth"].caption.partition("pooled over ")[2]
     assert pooled.startswith("needle gauge" if "axes" in options else "")
 
@@ -134,6 +134,20 @@ def test_cases_of_one_controller_have_separate_panels(sketched_on):
         assert "0.2" in base
         assert "0.7" in bent
         assert "pooled" not in drawn[name].caption
+
+
+def test_the_front_has_errors_and_peaks_of_finished_insertions(sketched_on, monkeypatch):
+    """Each controller's; the peak relative to E₁ of its row."""
+    shown = []
+    monkeypatch.setattr("flexneedle.lab.study.report.figures.draw_front", lambda panels: shown.extend(panels))
+    rows = make_rows(BOTH, targets=TARGETS[:1], repeats=2)
+    rows[3] = unfinished(rows[3])
+    for row, error, peak in zip(rows, (0.1, 0.2, 1.1, 1.2), (3.0, 4.0, 5.0, 6.0), strict=True):
+        row |= {"true_error_mm": error, "peak_energy_uj": peak, "energy_scale_uj": 2.0}
+    sketched_on(rows)
+    (panel,) = shown
+    found = {sample.name: (sample.errors.tolist(), sample.peaks.tolist()) for sample in panel.content}
+    assert found == {BOTH[0]: ([0.1, 0.2], [1.5, 2.0]), BOTH[1]: ([1.1], [2.5])}
 
 
 def test_numbers_of_the_page_are_those_of_the_summary(plain):

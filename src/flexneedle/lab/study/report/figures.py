@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import inf, isnan
+from math import inf, isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from flexneedle.figures.layout import Floats, Look, look
 from flexneedle.figures.style import INK, save
 from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
 from flexneedle.lab.study.figures.distributions import draw_errors
+from flexneedle.lab.study.figures.front import FrontSample, draw_front
 from flexneedle.lab.study.figures.panels import MOST_PANELS, Panel
 from flexneedle.lab.study.figures.samples import ErrorSample
 from flexneedle.lab.study.figures.shares import draw_shares
@@ -22,7 +23,7 @@ from flexneedle.lab.study.figures.sweeps import draw_sweep
 from flexneedle.lab.study.figures.targeting import TipPositions, draw_targeting
 from flexneedle.lab.study.findings.design import Factor, list_controllers
 from flexneedle.lab.study.findings.findings import Findings
-from flexneedle.lab.study.findings.groups import Difference, find_finished, group_depths
+from flexneedle.lab.study.findings.groups import Difference, find_finished, find_loads, group_depths
 from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Flags
 from flexneedle.lab.study.findings.worlds import find_failures
 
@@ -147,6 +148,12 @@ def _list_entries(f: _Facts) -> list[_Entry]:
             partial(_shares, f), draw_shares,
         ),
         _Entry(
+            "front", "True error against tissue energy", found.design.controller.varies and _has_peaks(f),
+            "Every finished insertion is a dot; medians with quartiles. Energy: largest value on the path, relative to "
+            "the energy of all tissue down to the target displaced by 1 mm.",
+            partial(_front, f), draw_front,
+        ),
+        _Entry(
             "targeting", "Final tip positions", not found.worlds and not np.isnan(rows.number("tip_x_mm")).all(),
             "True tips of all insertions, and targets with circles of 1 mm radius, to scale.",
             partial(_tips, f), draw_targeting,
@@ -209,6 +216,29 @@ def _shares(f: _Facts) -> list[Panel[Any]]:
         ]
         note = f"{len(np.unique(world[cases.codes == level]))} worlds"
         panels.append(Panel(title or "all", note, INK, samples))
+    return panels
+
+
+def _find_peaks(f: _Facts) -> Floats:
+    """Return the peak of the energy relative to E₁ (n,), NaN where it or the error is unknown."""
+    return np.where(f.known, find_loads(f.found.study.rows)["peak_energy_relative"], nan)
+
+
+def _has_peaks(f: _Facts) -> bool:
+    return not np.isnan(_find_peaks(f)).all()
+
+
+def _front(f: _Facts) -> list[Panel[Any]]:
+    peaks, cases = _find_peaks(f), f.found.design.cases
+    known, panels = ~np.isnan(peaks), []
+    for level, title in enumerate(cases.names[:MOST_PANELS]):
+        own = (cases.codes == level) & known
+        samples = [
+            FrontSample(name, look, f.error[own & theirs], peaks[own & theirs])
+            for name, theirs, look in f.controllers
+            if (own & theirs).any()
+        ]
+        panels.append(Panel(title or "all", f"{int(own.sum())} insertions", INK, samples))
     return panels
 
 
