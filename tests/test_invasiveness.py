@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 from flexneedle.invasiveness import Invasiveness
 from flexneedle.record.plain import plan_from_values, plan_values
 from flexneedle.scenario.files import load_scenario
-from flexneedle.types import DG_Y
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DG_Y, Control
 from synthetic import blind, make_insertion, make_plan
 
 PHANTOM = load_scenario("phantom")
@@ -145,3 +146,16 @@ def test_all_values_are_in_the_rows():
     for shown in ("1230, 0.0123, 3 µJ", "206, 0.00206, 0.5", "0.95", "7.25 mm", "4"):
         assert shown in text
     assert load.rows("rolls") != replace(load, estimated=True).rows("rolls")
+
+
+@pytest.mark.parametrize("name", ["phantom", "phantom3d"])
+def test_the_least_stretch_is_of_the_contacts_beside_the_needle(name):
+    """Also after it was pulled back; 1 without any."""
+    simulator = Simulator(name, threads=1)
+    states = [simulator.start()]
+    for advance in [1.0] * 50 + [-0.5] * 5:
+        states.append(simulator.step(states[-1], Control(db_x=advance, dg_y=0.03)))
+    assert [state.least_stretch for state in states] == [
+        state.contacts.stretch.min(initial=1.0) for state in states
+    ]
+    assert states[0].least_stretch == 1.0 > states[-1].least_stretch

@@ -176,7 +176,10 @@ class State:
     @property
     def least_stretch(self) -> float:
         """Least stretch λ of the tissue; 1 is unloaded."""
-        return float(self.contacts.stretch.min(initial=1.0))
+        nodes, needle = self.model.nodes, self.needle
+        behind = nodes["x"] < min(needle.channel.front, needle.solution.tip.x)
+        pressed = behind & (nodes["kind"] == CONTACT)
+        return 1.0 - float((np.abs(self.compression[pressed]) / nodes["height"][pressed]).max(initial=0.0))
 
     @cached_property
     def strain_energy(self) -> float:
