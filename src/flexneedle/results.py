@@ -63,6 +63,7 @@ class Plan:
         converged: Whether the search converged.
         history: One dict per iteration of the planner.
         limit: Limit that binds if the target is out of reach, else "".
+        refusal: Load of needle or tissue that the guard would refuse, else "".
         seconds: Wall-clock time (s) of the search.
         scenario: Scenario of the plan, None if unknown.
         versions: Versions that made a loaded plan, by package; empty for a new one.
@@ -84,6 +85,7 @@ class Plan:
     converged: bool
     history: tuple[dict[str, Any], ...]
     limit: str  # which limit binds if the target is out of reach, else ""
+    refusal: str = ""  # why the guard would refuse to carry it out, else ""
     seconds: float = field(default=0.0, compare=False)  # wall clock
     scenario: Scenario | None = None
     versions: Mapping[str, str] = field(default_factory=dict, compare=False)
@@ -118,13 +120,13 @@ class Plan:
 
     @property
     def reached(self) -> bool:
-        """Whether the plan ends within 1 mm of the target, the radius of the paper's target circles."""
-        return self.error_mm <= TARGET_RADIUS_MM
+        """Whether the plan ends within 1 mm of the target, the paper's target circle, and the guard would permit it."""
+        return self.error_mm <= TARGET_RADIUS_MM and not self.refusal
 
     @property
     def hit(self) -> bool:
         """Whether no limit binds and the target is inside the planned needle: see `is_hit`."""
-        return not self.limit and is_hit(self.error_mm, self.scenario)
+        return not self.limit and not self.refusal and is_hit(self.error_mm, self.scenario)
 
     @property
     def entry_angle(self) -> float:
@@ -148,6 +150,8 @@ class Plan:
         """One line: distance of the plan's end from the target, and the limit that binds if it misses."""
         binding = f", limited by {self.limit}" if self.limit else ""
         distance = format_mm(self.error_mm)
+        if self.refusal:
+            return f"ends {distance} from the target, but the guard would refuse it: {self.refusal}"
         if self.hit:
             return f"reaches the target to {distance}"
         if self.reached:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flexneedle.control.interface import Controller, Decision
-from flexneedle.loop.guard import Guard, bending_strain
+from flexneedle.loop.guard import Guard
+from flexneedle.simulator.excess import bending_strain
 from flexneedle.results import Action, Outcome
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of

@@ -4,7 +4,7 @@ The users are the planner (`plan`) and two controllers (`ce_mpc`, `adaptive_mpc`
 problem instead. A cost is the weighted sum of its terms, in the order of this file. A term is added by one decorated
 function:
 
-    @cost_term("mJ", at_end=("energy",), plan=Weight("energy", "energy_weight_per_mj", "1/mJ", 5.0, "Weight of …"))
+    @cost_term("mJ", at_end=("energy",), plan=Weight("end energy", "end_energy_weight_mm", "mm", 0.05, "Weight of …"))
     def energy_at_end(trajectories):
         return trajectories.energy[:, -1]
 
@@ -30,6 +30,9 @@ from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, 
 PLAN, CE_MPC, ADAPTIVE_MPC = Cost("plan"), Cost("ce_mpc"), Cost("adaptive_mpc")
 
 Complexes = NDArray[np.complex128]
+_SHARP_MM = 0.1  # miss of a plan from which its square counts more than the miss itself
+SHARE_OF_LIMIT = 0.8
+"""Share of a limit of the guard from which a load is charged."""
 
 
 def past_target(trajectories: Trajectories, target: Point) -> Complexes:
@@ -42,11 +45,6 @@ def past_target(trajectories: Trajectories, target: Point) -> Complexes:
 
 @cost_term(
     "mm",
-    plan=Weight(
-        "accuracy", "accuracy_weight_per_mm", "1/mm", 20.0,
-        "γ₁, weight of the final distance between tip and target.",
-        "larger if a plan names this key as its limit.",
-    ),
     adaptive_mpc=Weight("miss"),
 )  # fmt: skip
 def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats:
@@ -56,6 +54,14 @@ def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats
     """
     blurred: Floats = np.hypot(np.abs(past_target(trajectories, target)), blur) - blur
     return blurred
+
+
+@cost_term("mm", plan=Weight("miss"))
+def planned_miss(trajectories: Trajectories, target: Point) -> Floats:
+    """Return the lateral distance d from the target at its depth as |d| + d²/s (mm), s = 0.1 mm."""
+    distance = np.abs(past_target(trajectories, target))
+    charged: Floats = distance + distance**2 / _SHARP_MM
+    return charged
 
 
 @cost_term("mm", adaptive_mpc=Weight("large miss"))
@@ -75,8 +81,8 @@ def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float
     "mJ",
     at_end=("energy",),
     plan=Weight(
-        "energy", "energy_weight_per_mj", "1/mJ", 5.0,
-        "γ₂, weight of the final strain energy W of the tissue.",
+        "end energy", "end_energy_weight_mm", "mm", 0.05,
+        "Weight of the tissue energy at the target, relative to all tissue down to the target displaced by 1 mm.",
     ),
     adaptive_mpc=Weight(
         "energy", "energy_weight_mm", "mm", 0.7,
@@ -97,26 +103,58 @@ def energy_at_end(trajectories: Trajectories) -> Floats:
     "mm²",
     outputs=("deflection",),
     plan=Weight(
-        "deflection", "deflection_weight", "1/mm²", 0.002,
-        "Q, weight of the needle's mean square deflection (mm²), summed over the steps.",
+        "deflection", "bend_weight", "–", 0.16,
+        "Weight of the needle's mean square deflection, relative to the target's depth.",
     ),
 )  # fmt: skip
 def deflection(trajectories: Trajectories) -> Floats:
-    """Return the mean square deflection of the needle (mm²), summed over the steps in the tissue (paper eq. 10)."""
-    total: Floats = (trajectories.deflection * trajectories.inside).sum(axis=1)
-    return total
+    """Return the mean square deflection of the needle (mm²), averaged over the advance in the tissue (paper eq. 10)."""
+    return _mean_in_tissue(trajectories, trajectories.deflection)
 
 
 @cost_term(
-    "mm²",
+    "mJ",
+    outputs=("energy",),
     plan=Weight(
-        "guide", "guide_weight", "1/mm²", 1.0,
-        "R, weight of the guide's squared travel (mm²), summed over the steps.",
+        "mean energy", "mean_energy_weight_mm", "mm", 0.1,
+        "`end_energy_weight_mm` for the energy averaged over the advance in the tissue.",
     ),
 )  # fmt: skip
-def guide_motion(trajectories: Trajectories) -> Floats:
-    """Return the squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
-    total: Floats = (_guide_squares(trajectories) * trajectories.inside).sum(axis=1)
+def mean_energy(trajectories: Trajectories) -> Floats:
+    """Return the strain energy of the tissue (mJ), averaged over the advance in the tissue."""
+    return _mean_in_tissue(trajectories, trajectories.energy)
+
+
+@cost_term(
+    "mJ",
+    outputs=("energy",),
+    plan=Weight(
+        "peak energy", "peak_energy_weight_mm", "mm", 0.1,
+        "`end_energy_weight_mm` for the largest energy of all steps.",
+    ),
+)  # fmt: skip
+def peak_energy(trajectories: Trajectories) -> Floats:
+    """Return the largest strain energy of the tissue after a step (mJ)."""
+    return trajectories.energy.max(axis=1)
+
+
+@cost_term(
+    "1",
+    outputs=("loads", "strain", "stretch"),
+    plan=Weight(
+        "limits", "limit_weight_mm", "mm", 100.0,
+        "Weight of the needle's strain, the tissue's compression and the guide's force beyond 80 % of a limit of "
+        "`[guard]`, relative to that.",
+    ),
+)  # fmt: skip
+def load_excess(trajectories: Trajectories, strain: float, compression: float, force: float) -> Floats:
+    """Return the sum of the largest strain, compression and force of the guide (N) beyond 80 % of their limits.
+
+    Each is relative to 80 % of its limit.
+    """
+    guide = np.hypot(trajectories.loads[:, :, 4], trajectories.loads[:, :, 5])
+    largest = (trajectories.strain / strain, (1.0 - trajectories.stretch) / compression, guide / force)
+    total: Floats = sum(np.maximum(each.max(axis=1) / SHARE_OF_LIMIT - 1.0, 0.0) for each in largest)
     return total
 
 
@@ -137,14 +175,15 @@ def distance_from_line(trajectories: Trajectories, start: Point, target: Point) 
     x, y = trajectories.tips[:, :, X], across(trajectories.tips, Y)
     length, begin = target[0] - start[0], complex(*start[1:])
     slope = (complex(*target[1:]) - begin) / length if length != 0.0 else 0.0
-    away = np.abs(y - begin - slope * (x - start[0]))
-    share = np.where(trajectories.inside, trajectories.controls[:, :, DB_X], 0.0)
-    mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
-    return mean
+    return _mean_in_tissue(trajectories, np.abs(y - begin - slope * (x - start[0])))
 
 
 @cost_term(
     "1",
+    plan=Weight(
+        "guide", "slope_weight", "–", 0.05,
+        "Weight of the mean square slope of the guide's path, times the target's depth.",
+    ),
     adaptive_mpc=Weight(
         "slope", "slope_weight_mm", "mm", 0.5,
         "Weight of the mean square slope of the guide's path, times the remaining share of the path.",
@@ -164,8 +203,8 @@ def guide_slope(trajectories: Trajectories) -> Floats:
 @cost_term(
     "1",
     plan=Weight(
-        "flips", "flip_weight", "–", 0.3,
-        "R of the flip input, cost of a roll of the bevel.",
+        "flips", "roll_weight_mm", "mm", 0.015,
+        "Cost of a roll of the bevel.",
     ),
     adaptive_mpc=Weight(
         "flips", "roll_weight_mm", "mm", 0.03,
@@ -256,6 +295,13 @@ def energy_of_steps(trajectories: Trajectories) -> Floats:
     """Return the strain energy of the tissue, summed over the steps (mJ)."""
     total: Floats = trajectories.energy.sum(axis=1)
     return total
+
+
+def _mean_in_tissue(trajectories: Trajectories, values: Floats) -> Floats:
+    """Return values of the steps (N, m), averaged over the advance in the tissue."""
+    share = np.where(trajectories.inside, trajectories.controls[:, :, DB_X], 0.0)
+    mean: Floats = (values * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
+    return mean
 
 
 def _guide_squares(trajectories: Trajectories) -> Floats:

@@ -1,16 +1,18 @@
 """The limit that keeps a plan from its target, by the key that sets it."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
-from flexneedle.costs.terms import PLAN
+from flexneedle.costs.terms import SHARE_OF_LIMIT
 from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.problem import LATERAL, PlanProblem
 from flexneedle.planning.steering import radius, reach
 from flexneedle.results import TARGET_RADIUS_MM, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.simulator.excess import Excess
 from flexneedle.simulator.state import State
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, Floats, X, Z, across
 
@@ -53,8 +55,16 @@ def find_limit(
     ):
         if largest > _AT_LIMIT * getattr(setup, name):
             return f"setup.{name} = {getattr(setup, name):g}"
-    weight = PLAN.weights(scenario.plan)["accuracy"]
-    return f"plan.{PLAN.key('accuracy')} = {weight:g} (other costs outweigh the miss)"
+    charged = find_largest_load(problem, states)
+    if charged.share > _AT_LIMIT * SHARE_OF_LIMIT:
+        return f"guard.{charged.key} (a plan uses up to {SHARE_OF_LIMIT:.0%} of it)"
+    return f"plan.samples = {scenario.plan.samples} (the search found no better plan)"
+
+
+def find_largest_load(problem: PlanProblem, states: Iterable[State]) -> Excess:
+    """Return the load of all states that is the largest share of its limit."""
+    loads = (load for state in states for load in problem.loads.excesses(state))
+    return max(loads, key=lambda load: load.share)
 
 
 def _limit_of_bevel(scenario: Scenario, problem: PlanProblem, rollout: RolloutFunction) -> str:

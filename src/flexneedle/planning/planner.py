@@ -16,8 +16,8 @@ from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.entry import mounted_axes, with_entry
 from flexneedle.planning.events import Iterated, Listener, send_event
 from flexneedle.planning.horizon import OnIteration, count_iterations
-from flexneedle.planning.limit import find_limit
-from flexneedle.planning.primitives import Solution, search_primitives, widen_search
+from flexneedle.planning.limit import find_largest_load, find_limit
+from flexneedle.planning.primitives import Solution, fix_guide, search_primitives, widen_search
 from flexneedle.planning.problem import PlanProblem, make_problem
 from flexneedle.planning.steering import MOST_ROLLS, reach, search_rolls
 from flexneedle.results import TARGET_RADIUS_MM, Plan, format_mm
@@ -30,6 +30,7 @@ from flexneedle.types import DB_X, Control, Floats, X, Z
 
 _TARGET = "depth and lateral offsets in mm"
 _DEPTH_TOLERANCE_MM = 1e-6
+_PRECISE_MM = 0.1  # miss of a plan above which other searches are made
 # plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
@@ -47,8 +48,8 @@ def plan(
 ) -> Plan:
     """Plan an insertion to a target by the cross-entropy method. Same seed, same plan.
 
-    If the plan misses its target although guide or base may move, the search is repeated with wider samples, and the
-    better plan is returned.
+    If the plan misses its target by more than 0.1 mm although guide or base may move, the search is repeated with wider
+    samples, then with the bevel alone, and the plan of least cost is returned.
 
     Args:
         scenario: A scenario, its name or its path, as for `load_scenario`.
@@ -72,12 +73,15 @@ def plan(
     simulator = Simulator(scenario, threads)
     problem, progress = make_problem(scenario, goal, strategy), _report_to(listeners, strategy)
     found = _carry_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
-    if not found.reached and not problem.bevel_alone:
+    if not problem.bevel_alone:
         # A search that begins with small lateral steps can lose its spread before it gets to a far target.
-        usual = found.iterations + scenario.plan.iterations
-        after = count_iterations(progress, found.iterations, usual, found.cost)
-        again = _search(simulator, widen_search(problem), rng, after)
-        found = _choose_better(found, _carry_out(simulator, problem, strategy, seed, again))
+        for other in (widen_search(problem), fix_guide(problem)):
+            if found.error_mm <= _PRECISE_MM:
+                break
+            usual = found.iterations + scenario.plan.iterations
+            after = count_iterations(progress, found.iterations, usual, found.cost)
+            again = _search(simulator, other, rng, after)
+            found = _choose_better(found, _carry_out(simulator, problem, strategy, seed, again))
     return replace(found, seconds=time.perf_counter() - begun)
 
 
@@ -174,6 +178,7 @@ def _carry_out(
         converged=solution.search_state.converged,
         history=solution.search_state.history,
         limit=find_limit(simulator.scenario, problem, _make_rollout(simulator, ()), rows, states),
+        refusal=load.text if (load := find_largest_load(problem, states)).share > 1.0 else "",
         least_stretch=np.array([state.least_stretch for state in states]),
         scenario=simulator.scenario,
     )

@@ -68,6 +68,13 @@ def widen_search(problem: PlanProblem) -> PlanProblem:
     return replace(problem, sigma=sigma)
 
 
+def fix_guide(problem: PlanProblem) -> PlanProblem:
+    """Return the problem with guide and base fixed, so that only the bevel steers."""
+    sigma = problem.sigma.copy()
+    sigma[LATERAL : problem.bevel.start] = 0.0
+    return replace(problem, sigma=sigma)
+
+
 def make_solution(problem: PlanProblem, found: Found) -> Solution:
     """Return the solution: without steps that do not advance, rolled before the first."""
     controls = found.trajectories.controls[0]

@@ -10,6 +10,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Limits
+from flexneedle.simulator.excess import NO_LIMITS, LoadLimits
 from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, Floats, Point
 
 ADVANCE, LATERAL = range(2)
@@ -47,11 +48,20 @@ class PlanProblem:
     # changes of point and slope of an entry within `lateral_travel`
     home: tuple[complex, complex] = (0.0, 0.0)
     left: complex = 0.0  # vector y + iz from the nearest axis that is permitted to the target
+    energy: float = 0.0  # E₁ (mJ), of all tissue down to the target displaced by 1 mm
+    loads: LoadLimits = NO_LIMITS
 
     @property
     def terms(self) -> tuple[Term, ...]:
         """Terms of the cost. A roll before the first step is not charged."""
-        return PLAN.terms(self.settings, target=self.target, first=1)
+        weights, depth = PLAN.weights(self.settings), self.target[0]
+        for name in ("end energy", "mean energy", "peak energy"):
+            weights[name] = weights[name] / self.energy if self.energy > 0.0 else 0.0
+        weights["deflection"] /= depth
+        weights["guide"] *= depth
+        loads = self.loads
+        limits = {"strain": loads.strain, "compression": float(loads.compression.min()), "force": loads.force}
+        return PLAN.terms(self.settings, weights, target=self.target, first=1, **limits)
 
     @property
     def entry_coordinates(self) -> int:
@@ -138,4 +148,6 @@ def make_problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
         left=toward - point - slope * goal[0],
         axis=axis,
         mounts=(scenario.start_base_x, setup.guide_x or 0.0),
+        energy=scenario.energy_scale(goal[0]),
+        loads=LoadLimits.of(scenario),
     )

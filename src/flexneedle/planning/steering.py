@@ -100,8 +100,7 @@ def _margin(rollout: RolloutFunction, problem: PlanProblem) -> tuple[Term, ...]:
         outside: Floats = np.maximum(np.abs(off - middle) - half, 0.0)
         return outside
 
-    weight = next(term.weight for term in problem.terms if term.name == "accuracy")
-    return (Term("margin", weight, beyond),)
+    return (Term("margin", 1.0, beyond),)
 
 
 def _variables(problem: PlanProblem, side: float, rolls: int, mean: Floats, sigma: float) -> Variables:

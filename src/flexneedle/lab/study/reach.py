@@ -15,7 +15,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.types import Control, Point, X, Y, Z
 
-_ONLY_THE_MISS = {f"plan.{key}": value for key, value in PLAN.only("accuracy").items()}
+_ONLY_THE_MISS = {f"plan.{key}": value for key, value in PLAN.only("miss").items()}
 _SEARCHES = ((48, 10), (160, 25))
 """Samples and iterations: the second search, 14 times the longest decision of the default controller, is made if the
 first one misses. The planner makes each of them again, with wider samples, if its plan misses by more than 1 mm."""

@@ -1,10 +1,13 @@
 """The target and the settings of planner, controllers and virtual phantom."""
 
+import warnings
+from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
 from flexneedle.costs.terms import PLAN
+from flexneedle.errors import ScenarioWarning
 from flexneedle.scenario.problems import Problem, refuse, unknown_key
 from flexneedle.scenario.sections.fields import (
     Fraction,
@@ -35,6 +38,15 @@ class Target(Section):
         return self.depth_mm, self.lateral_mm, self.lateral_z_mm
 
 
+_OLD_WEIGHTS = (
+    "accuracy_weight_per_mm",
+    "energy_weight_per_mj",
+    "deflection_weight",
+    "guide_weight",
+    "flip_weight",
+)
+
+
 @with_weights(PLAN)
 class PlanSettings(Section):
     """Section `plan`: the cross-entropy method and the cost of a plan."""
@@ -61,6 +73,24 @@ class PlanSettings(Section):
     """Initial standard deviation of the base's lateral travel per step; 0: fixed."""
     base_turn_sigma_mrad: NonNegative = 0.0
     """Initial standard deviation of the base's rotation per step; 0: fixed."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_old_weights(cls, values: Any) -> Any:
+        """Return the values without weights of the cost before it was a length; a ScenarioWarning names them.
+
+        For version 0.1 only.
+        """
+        if not isinstance(values, Mapping):
+            return values
+        if old := [key for key in values if key in _OLD_WEIGHTS]:
+            keys = ", ".join(f"plan.{key}" for key in old)
+            line = f"{keys}: no longer used, since the cost of a plan is a length: see plan.peak_energy_weight_mm"
+            warnings.warn(line, ScenarioWarning, stacklevel=2)
+        if values.get("own_terms"):
+            line = "plan.own_terms: weights give mm now; before, a miss of 1 mm had a cost of 20"
+            warnings.warn(line, ScenarioWarning, stacklevel=2)
+        return {key: value for key, value in values.items() if key not in _OLD_WEIGHTS}
 
     @property
     def base_turn_sigma(self) -> float:

@@ -74,7 +74,7 @@ def _end(task: WorkerTask, size: Size, depth: float, direction: complex) -> Poin
     far = axis + direction * most / max(abs(direction.real), abs(direction.imag)) * (1.0 - 1e-9)
     target: Point = (depth, far.real, far.imag if scenario.setup.axes == 2 else 0.0)
     found = plan(
-        with_smaller_search(scenario, *size, **PLAN.only("accuracy")),
+        with_smaller_search(scenario, *size, **PLAN.only("miss")),
         target,
         task.order.strategy,
         task.order.seed,
