@@ -62,12 +62,12 @@ class Plan:
         iterations: Iterations of the search.
         converged: Whether the search converged.
         history: One dict per iteration of the planner.
-        limit: Limit that binds if the target is out of reach, else "".
-        refusal: Load of needle or tissue that the guard would refuse, else "".
+        limit: Limit that binds if the plan does not reach its target, else "".
         seconds: Wall-clock time (s) of the search.
         scenario: Scenario of the plan, None if unknown.
         versions: Versions that made a loaded plan, by package; empty for a new one.
         least_stretch: Least stretch λ of the tissue (m + 1,); NaN (1,): unknown.
+        refusal: Load of needle or tissue for which the guard would refuse the plan, else "".
     """
 
     strategy: str
@@ -84,12 +84,12 @@ class Plan:
     iterations: int
     converged: bool
     history: tuple[dict[str, Any], ...]
-    limit: str  # which limit binds if the target is out of reach, else ""
-    refusal: str = ""  # why the guard would refuse to carry it out, else ""
+    limit: str
     seconds: float = field(default=0.0, compare=False)  # wall clock
     scenario: Scenario | None = None
     versions: Mapping[str, str] = field(default_factory=dict, compare=False)
     least_stretch: Floats = field(default_factory=lambda: np.full(1, math.nan))
+    refusal: str = ""
 
     @property
     def tip_mm(self) -> Point:
@@ -120,13 +120,13 @@ class Plan:
 
     @property
     def reached(self) -> bool:
-        """Whether the plan ends within 1 mm of the target, the paper's target circle, and the guard would permit it."""
+        """Whether the plan ends within 1 mm of the target (the paper's target circle) and the guard permits it."""
         return self.error_mm <= TARGET_RADIUS_MM and not self.refusal
 
     @property
     def hit(self) -> bool:
         """Whether no limit binds and the target is inside the planned needle: see `is_hit`."""
-        return not self.limit and not self.refusal and is_hit(self.error_mm, self.scenario)
+        return not (self.limit or self.refusal) and is_hit(self.error_mm, self.scenario)
 
     @property
     def entry_angle(self) -> float:
@@ -151,7 +151,9 @@ class Plan:
         binding = f", limited by {self.limit}" if self.limit else ""
         distance = format_mm(self.error_mm)
         if self.refusal:
-            return f"ends {distance} from the target, but the guard would refuse it: {self.refusal}"
+            return (
+                f"ends {distance} from the target; the guard would refuse it: {self.refusal} ({self.limit})"
+            )
         if self.hit:
             return f"reaches the target to {distance}"
         if self.reached:

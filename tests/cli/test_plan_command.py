@@ -10,7 +10,18 @@ from flexneedle.invasiveness import format_number
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 STRATEGIES = ("manipulation", "steering")
 PLAN_KEYS = [
-    *("tip_mm", "error_mm", "reached", "entry", "cost", "terms", "flips", "strain_energy_mj"),
+    *(
+        "tip_mm",
+        "error_mm",
+        "reached",
+        "limit",
+        "refusal",
+        "entry",
+        "cost",
+        "terms",
+        "flips",
+        "strain_energy_mj",
+    ),
     *(
         "peak_energy_uj",
         "mean_energy_uj",

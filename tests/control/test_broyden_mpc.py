@@ -120,8 +120,9 @@ def straight(plan, lateral):
 
 def test_free_of_limits_and_weight_the_prediction_meets_the_path_at_every_step(quick_plan):
     jacobian = np.array([[1.0, 0.0], [0.1, 0.8]])
-    found, cost = moves(quick_plan, jacobian, (12.0, 1.3), guide_weight=0.0)
-    tip = 1.3 + 0.1 * np.arange(1, 5) + 0.8 * found
+    begin = float(np.interp(12.0, quick_plan.tips[:, X], quick_plan.tips[:, Y])) - 0.2
+    found, cost = moves(quick_plan, jacobian, (12.0, begin), guide_weight=0.0)
+    tip = begin + 0.1 * np.arange(1, 5) + 0.8 * found
     goal = np.interp(12.0 + np.arange(1, 5), quick_plan.tips[:, X], quick_plan.tips[:, Y])
     unlimited = np.abs(found) < 0.5 * np.arange(1, 5)
     assert unlimited.any()

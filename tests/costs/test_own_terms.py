@@ -13,6 +13,8 @@ from flexneedle.costs.weighted_sum import Trajectories, evaluate_cost
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.types import DG_Y
 
+# Without another test's warning (tests/scenario/test_old_weights.py).
+pytestmark = pytest.mark.filterwarnings("ignore:plan.own_terms. the cost of a plan is in mm now")
 SMALL = {"plan.samples": 32, "plan.iterations": 2, "plan.max_iterations": 2}
 
 
@@ -40,7 +42,7 @@ def with_terms(*terms, section="plan", **changes):
 
 @pytest.mark.usefixtures("module")
 def test_a_plan_charges_a_term_by_name_and_passes_the_target_to_one_that_takes_it():
-    scenario = with_terms(("own_costs:guide_speed", 100.0), ("own_costs:depth_left", 2.0))
+    scenario = with_terms(("own_costs:guide_speed", 100.0), ("own_costs:depth_left", 0.1))
     plan = flexneedle.plan(scenario, threads=1)
     assert plan.terms.keys() >= {"own_costs:guide_speed", "own_costs:depth_left"}
     assert plan.cost == pytest.approx(sum(plan.terms.values()), rel=1e-6)

@@ -41,8 +41,9 @@ TRAJECTORIES = Trajectories(
         (terms.flips, [2.0, 1.0]),
         (partial(terms.flips, first=1), [1.0, 1.0]),
         (partial(terms.out_of_reach, expected=np.array([0.3, 0.7])), [0.7, 0.3]),
-        (terms.deflection, [6.0 + 7.0, 8.0 + 9.0]),
-        (terms.guide_motion, [0.04 + 0.16, 0.09]),
+        (terms.deflection, [(2 * 6.0 + 2 * 7.0) / 4.0, (8.0 + 0.5 * 9.0) / 1.5]),
+        (terms.mean_energy, [(2 * 1.0 + 2 * 4.0) / 4.0, (2.0 + 0.5 * 3.0) / 1.5]),
+        (terms.peak_energy, [4.0, 3.0]),
         (
             partial(terms.guide_departure, nominal=np.array([[0.1, 0.0], [0.0, 0.0], [0.1, 0.0]])),
             [0.04 + 0.25, 0.04 + 0.01],
@@ -51,6 +52,33 @@ TRAJECTORIES = Trajectories(
 )
 def test_term_against_numbers_by_hand(term, expected):
     np.testing.assert_allclose(term(TRAJECTORIES), expected, rtol=1e-14)
+
+
+def test_a_planned_miss_costs_its_length_and_its_square_over_a_tenth_of_a_millimetre():
+    """Linear near the target, so that it is met exactly; at 0.1 mm twice the distance, at 1 mm eleven times."""
+    tips = np.zeros((4, 1, 5))
+    tips[:, 0, X], tips[:, 0, Y] = 40.0, (1e-4, 0.1, -1.0, 3.0)
+    charged = terms.planned_miss(replace(TRAJECTORIES, tips=tips), (40.0, 0.0, 0.0))
+    np.testing.assert_allclose(charged, [1e-4 + 1e-7, 0.2, 11.0, 93.0], rtol=1e-12)
+
+
+def test_an_energy_peak_counts_wherever_it_is():
+    early = replace(TRAJECTORIES, energy=np.array([[0.0, 9.0, 4.0], [5.0, 3.0, 3.0]]))
+    np.testing.assert_array_equal(terms.peak_energy(early), [9.0, 5.0])
+
+
+@pytest.mark.parametrize("shift", [0, 1, 2])
+def test_loads_are_charged_beyond_four_fifths_of_their_limits(shift):
+    """The largest of all steps counts: strain 1.25, compression 1.5, force (3, −4) N 2 times the 80 %."""
+    strain = np.array([[0.0, 0.01, 0.002], [0.008, 0.0, 0.0]])
+    stretch = np.array([[1.0, 0.4, 0.9], [0.6, 1.0, 1.0]])
+    loads = np.zeros((2, 3, 6))
+    loads[0, 1, 4:], loads[1, 1, 4], loads[:, :, :4] = (3.0, -4.0), 2.5, 99.0
+    rolled = [np.roll(each, shift, axis=1) for each in (strain, stretch, loads)]
+    given = replace(TRAJECTORIES, **dict(zip(("strain", "stretch", "loads"), rolled, strict=True)))
+    for limits, excess in (((0.01, np.inf), 0.25), ((np.inf, 0.5), 0.5), ((0.01, 0.5), 0.25 + 0.5)):
+        np.testing.assert_allclose(terms.load_excess(given, *limits), [excess, 0.0], atol=1e-12)
+    np.testing.assert_allclose(terms.guide_force_excess(given, 3.125), [1.0, 0.0], atol=1e-12)
 
 
 def turned(trajectories, angle):
@@ -79,7 +107,7 @@ def test_no_term_prefers_a_direction_across_the_axis(angle):
             "large": terms.large_miss(given, place(4.0, -0.5), 0.1, 0.3),
             "line": terms.distance_from_line(given, (0.0, 0.0, 0.0), place(4.0, -1.0)),
             "slope": terms.guide_slope(given),
-            "motion": terms.guide_motion(given),
+            "planned": terms.planned_miss(given, place(4.0, -0.5)),
             "deviation": terms.deviation(given, poses, 3.0),
             "departure": terms.guide_departure(given, nominal),
         }
@@ -125,6 +153,7 @@ def test_in_air_and_without_an_advance_nothing_is_divided_by_zero():
     np.testing.assert_array_equal(
         terms.distance_from_line(still, (0.0, 0.0, 0.0), (4.0, 1.0, 0.0)), [0.0, 0.0]
     )
+    np.testing.assert_array_equal(terms.mean_energy(still), [0.0, 0.0])
 
 
 def test_deviation_weighs_an_angle_as_a_distance_and_changes_no_tips():
@@ -137,12 +166,15 @@ def test_deviation_weighs_an_angle_as_a_distance_and_changes_no_tips():
     np.testing.assert_array_equal(TRAJECTORIES.tips, before)
 
 
-def test_a_slope_does_not_depend_on_the_length_of_the_steps():
+@pytest.mark.parametrize("term", [terms.guide_slope, terms.mean_energy, terms.deflection])
+def test_a_mean_does_not_depend_on_the_length_of_the_steps(term):
     """Halving every step leaves the guide's slope, where the paper's sum of squares halves."""
     controls = np.repeat(CONTROLS, 2, axis=1)
     controls[:, :, [DB_X, DG_Y]] *= 0.5
-    halved = replace(TRAJECTORIES, controls=controls)
-    np.testing.assert_allclose(terms.guide_slope(halved), terms.guide_slope(TRAJECTORIES))
+    repeated = {
+        name: np.repeat(getattr(TRAJECTORIES, name), 2, axis=1) for name in ("tips", "energy", "deflection")
+    }
+    np.testing.assert_allclose(term(replace(TRAJECTORIES, controls=controls, **repeated)), term(TRAJECTORIES))
 
 
 def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():

@@ -220,7 +220,7 @@ def test_plans_are_drawn_in_all_views_with_both_angles_of_entry():
     plans = [turned_plan(make_plan(), np.pi / 2), turned_plan(make_plan("steering"), np.pi / 2)]
     figure = plan_figure(SPACE, plans)
     found = " ".join(text.replace("\n", " ") for text in texts(figure))
-    assert "manipulation: reaches the target to 0.010 mm (cost 7.600), enters at +0.0° and −2.7°" in found
+    assert "manipulation: reaches the target to 0.010 mm (cost 7.6), enters at +0.0° and −2.7°" in found
     (section,) = axes(figure, "steering z")
     (path,) = lines(section, "planned path, steering")
     np.testing.assert_array_equal(path.get_xydata(), plans[1].tips[:, [X, Z]])

@@ -29,7 +29,7 @@ VARIABLES = horizon.Variables(
 )
 TERMS = (
     Term("miss", 1.0, lambda trajectories: terms.miss(trajectories, TARGET)),
-    Term("guide", 0.1, terms.guide_motion),
+    Term("guide", 0.4, terms.guide_slope),
 )
 
 

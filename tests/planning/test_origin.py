@@ -21,7 +21,7 @@ OF_THE_PLAN = {
     "setup.tip_to_skin_mm": 20.0,
     "tissue.1.alpha": 9.0,
     "contact.spacing_mm": 0.5,
-    "plan.energy_weight_per_mj": 0.0,
+    "plan.end_energy_weight_mm": 0.0,
 }
 NOT_OF_THE_PLAN = {
     "name": "Other",

@@ -83,7 +83,7 @@ def test_a_target_behind_the_range_is_aimed_at_from_within_it(strategy):
 def test_where_half_a_turn_is_in_the_range_a_free_driver_has_the_same_plan():
     """The angles are the same; rolls go to and fro."""
     free, limited = (
-        planned(-0.4 + 0.3j, setup__max_rotation_deg=most, plan__flip_weight=0.0) for most in (None, 180.0)
+        planned(-0.4 + 0.3j, setup__max_rotation_deg=most, plan__roll_weight_mm=0.0) for most in (None, 180.0)
     )
     assert limited.roll == free.roll
     assert limited.cost == pytest.approx(free.cost, rel=1e-6)

@@ -10,6 +10,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from flexneedle.costs.terms import PLAN
 from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
@@ -24,17 +25,13 @@ BEND = 0.01  # curvature of the tip's path, 1/mm
 def problem(lateral, energy_weight=0.0, **changes):
     """8 mm in air and 20 mm in tissue, steps of 3 mm, which do not divide it."""
     settings = PlanSettings(
-        accuracy_weight_per_mm=20.0,
-        energy_weight_per_mj=energy_weight,
-        deflection_weight=0.0,
-        guide_weight=0.0,
-        flip_weight=0.01,
+        **PLAN.only("miss") | {"end_energy_weight_mm": energy_weight, "roll_weight_mm": 5e-4},
     )
     made = PlanProblem(
         target=(20.0, lateral, 0.0), travel=28.0, air=8.0, primitives=1,
         step=np.array([3.0, 0.5, 0.0, 0.005, 0.0, 0.5, 0.0]),
         reach=np.array([50.0, 1.0, 1.0, np.inf, np.inf, 2.0, 2.0]), sigma=np.zeros(6),
-        settings=settings,
+        settings=settings, energy_scale=1.0,
     )  # fmt: skip
     return replace(made, **changes)
 
@@ -116,7 +113,7 @@ def test_beyond_reach_the_bevel_stays_on_the_targets_side(side):
     found = steering.search_rolls(kinematic, problem(side * 3.0), SEARCH, np.random.default_rng(0))
     assert math.cos(found.roll) == side
     assert (found.controls[:, ROLL] == 0.0).all()
-    assert found.terms["accuracy"] == pytest.approx(20.0)
+    assert found.terms["miss"] == pytest.approx(11.0)
 
 
 def test_more_rolls_are_made_where_they_pay():
@@ -127,7 +124,7 @@ def test_more_rolls_are_made_where_they_pay():
 
     rolls = [
         int((found.controls[:, ROLL] > 0.0).sum())
-        for weight in (0.0, 100.0)
+        for weight in (0.0, 5.0)
         for found in [
             steering.search_rolls(
                 swinging, problem(0.0, energy_weight=weight), SEARCH, np.random.default_rng(0)

@@ -18,7 +18,7 @@ A term outside of the package is a function of `trajectories`, or of `trajectori
 scenario with its weight, as `[[plan.own_terms]]`, `[[control.ce_mpc.own_terms]]` or
 `[[control.adaptive_mpc.own_terms]]`: `term = "module:NAME"`, `weight = 0.5`.
 
-The terms with sums over steps are from the paper (eq. 10 and 13) and depend on the length of a step.
+The terms with sums over steps are from the paper (eq. 13) and depend on the length of a step.
 """
 
 import numpy as np
@@ -30,9 +30,9 @@ from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, 
 PLAN, CE_MPC, ADAPTIVE_MPC = Cost("plan"), Cost("ce_mpc"), Cost("adaptive_mpc")
 
 Complexes = NDArray[np.complex128]
-_SHARP_MM = 0.1  # miss of a plan from which its square counts more than the miss itself
+_SHARP_MM = 0.1  # miss of a plan above which its square costs more than the miss itself
 SHARE_OF_LIMIT = 0.8
-"""Share of a limit of the guard from which a load is charged."""
+"""Share of a limit of the guard above which a load is charged."""
 
 
 def past_target(trajectories: Trajectories, target: Point) -> Complexes:
@@ -43,10 +43,7 @@ def past_target(trajectories: Trajectories, target: Point) -> Complexes:
     return vector
 
 
-@cost_term(
-    "mm",
-    adaptive_mpc=Weight("miss"),
-)  # fmt: skip
+@cost_term("mm", adaptive_mpc=Weight("miss"))
 def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats:
     """Return the lateral distance (mm) from the target at its depth, the size of `past_target`.
 
@@ -59,9 +56,12 @@ def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats
 @cost_term("mm", plan=Weight("miss"))
 def planned_miss(trajectories: Trajectories, target: Point) -> Floats:
     """Return the lateral distance d from the target at its depth as |d| + d²/s (mm), s = 0.1 mm."""
-    distance = np.abs(past_target(trajectories, target))
-    charged: Floats = distance + distance**2 / _SHARP_MM
-    return charged
+    return charge_miss(np.abs(past_target(trajectories, target)))
+
+
+def charge_miss(distance: Floats) -> Floats:
+    """Return the cost (mm) of distances (mm) of planned ends from the target."""
+    return distance + distance**2 / _SHARP_MM
 
 
 @cost_term("mm", adaptive_mpc=Weight("large miss"))
@@ -135,27 +135,31 @@ def mean_energy(trajectories: Trajectories) -> Floats:
 )  # fmt: skip
 def peak_energy(trajectories: Trajectories) -> Floats:
     """Return the largest strain energy of the tissue after a step (mJ)."""
-    return trajectories.energy.max(axis=1)
+    peak: Floats = trajectories.energy.max(axis=1)
+    return peak
 
 
 @cost_term(
     "1",
-    outputs=("loads", "strain", "stretch"),
+    outputs=("strain", "stretch"),
     plan=Weight(
         "limits", "limit_weight_mm", "mm", 100.0,
-        "Weight of the needle's strain, the tissue's compression and the guide's force beyond 80 % of a limit of "
-        "`[guard]`, relative to that.",
+        "Weight of the needle's strain, the tissue's compression and the guide's force beyond 80 % of their limits in "
+        "`[guard]`, relative to these 80 %.",
     ),
 )  # fmt: skip
-def load_excess(trajectories: Trajectories, strain: float, compression: float, force: float) -> Floats:
-    """Return the sum of the largest strain, compression and force of the guide (N) beyond 80 % of their limits.
+def load_excess(trajectories: Trajectories, strain: float, compression: float) -> Floats:
+    """Return the excesses max(0, load / (0.8 limit) − 1) of the needle's strain and the tissue's compression, summed.
 
-    Each is relative to 80 % of its limit.
+    Of each, the largest of all steps counts.
     """
-    guide = np.hypot(trajectories.loads[:, :, 4], trajectories.loads[:, :, 5])
-    largest = (trajectories.strain / strain, (1.0 - trajectories.stretch) / compression, guide / force)
-    total: Floats = sum(np.maximum(each.max(axis=1) / SHARE_OF_LIMIT - 1.0, 0.0) for each in largest)
-    return total
+    return _excess(trajectories.strain / strain) + _excess((1.0 - trajectories.stretch) / compression)
+
+
+@cost_term("1", outputs=("loads",), plan=Weight("guide force"))
+def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
+    """Return the excess of the guide's force over its limit (N), as `load_excess`."""
+    return _excess(np.hypot(trajectories.loads[:, :, 4], trajectories.loads[:, :, 5]) / force)
 
 
 @cost_term(
@@ -302,6 +306,12 @@ def _mean_in_tissue(trajectories: Trajectories, values: Floats) -> Floats:
     share = np.where(trajectories.inside, trajectories.controls[:, :, DB_X], 0.0)
     mean: Floats = (values * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
     return mean
+
+
+def _excess(shares: Floats) -> Floats:
+    """Return max(0, share / 0.8 − 1) of the largest share of a limit (N, m) of each sequence."""
+    excess: Floats = np.maximum(shares.max(axis=1) / SHARE_OF_LIMIT - 1.0, 0.0)
+    return excess
 
 
 def _guide_squares(trajectories: Trajectories) -> Floats:

@@ -37,7 +37,7 @@ class Trajectories:
     loads: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     ends: Sequence[Any] = ()
 
-    @property
+    @cached_property
     def inside(self) -> NDArray[np.bool_]:
         """Steps (N, m) that advance and end with the tip in the tissue."""
         inside: NDArray[np.bool_] = (self.tips[:, :, X] > 0.0) & (self.controls[:, :, DB_X] > 0.0)

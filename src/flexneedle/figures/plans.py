@@ -99,7 +99,7 @@ def _result(scenario: Scenario, plan: Plan) -> str:
     entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"
     if is_column():
         return f"{plan.strategy}: {_outcome(plan)}".replace(" mm", "\u00a0mm")
-    return f"{plan.strategy}: {_outcome(plan)} (cost {plan.cost:.3f}){entry}"
+    return f"{plan.strategy}: {_outcome(plan)} (cost {plan.cost:.3g}){entry}"
 
 
 def _outcome(plan: Plan) -> str:
@@ -108,6 +108,8 @@ def _outcome(plan: Plan) -> str:
         return plan.summary
     limit = f", limited by {plan.limit.partition(' (')[0]}" if plan.limit else ""
     distance = format_mm(plan.error_mm)
+    if plan.refusal:
+        return f"ends {distance} from the target, refused by {plan.limit}"
     if plan.reached:
         return f"ends {distance} from the target{limit}"
     return f"MISSES the target by {distance}{limit}"
@@ -160,7 +162,7 @@ def _write_terms(ax: Axes, plans: Sequence[Plan], names: Sequence[str]) -> None:
     """Write the values of each term beside its longest bar, in the order of the plans."""
     for row, name in enumerate(names):
         values = [plan.terms.get(name, 0.0) for plan in plans]
-        text = " and ".join(f"{value:.3f}" for value in values)
+        text = " and ".join(f"{value:.3g}" for value in values)
         how: dict[str, Any] = {"va": "center", "fontsize": small(), "textcoords": "offset points"}
         ax.annotate(text, (max(0.0, *values), row), (2, 0), **how)
 
@@ -175,7 +177,7 @@ def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
         where = rows + (k - (len(plans) - 1) / 2) * thick
         bars = ax.barh(where, values, 0.9 * thick, color=STRATEGIES[k], label=plan.strategy)
         if not is_column():
-            ax.bar_label(bars, [f"{value:.3f}" for value in values], padding=2, fontsize=min(7.5, small()))
+            ax.bar_label(bars, [f"{value:.3g}" for value in values], padding=2, fontsize=min(7.5, small()))
     if is_column():
         _write_terms(ax, plans, names)
     ax.set_yticks(rows, names)
@@ -183,5 +185,5 @@ def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
     ax.invert_yaxis()
     ax.margins(x=0.4 if is_column() else 0.2)
     ax.locator_params(axis="x", nbins=4)
-    costs = " and ".join(f"{plan.cost:.3f}" for plan in plans)
-    ax.set_title(f"Terms of the cost, {costs} in all" if is_column() else "Terms of the cost")
+    costs = " and ".join(f"{plan.cost:.3g}" for plan in plans)
+    ax.set_title(f"Terms of the cost, {costs} mm in all" if is_column() else "Terms of the cost (mm)")

@@ -105,10 +105,9 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
     chosen = choices.controller
     check_choices(scenario, plan.strategy, choices)
     if not (plan.reached or choices.force or chosen.predicts):
-        raise RunError(
-            f"plan misses the target by {format_mm(plan.error_mm)} (limit {format_mm(TARGET_RADIUS_MM)}), "
-            f"limited by {plan.limit}; to insert anyway: flexneedle insert --force (force=True)"
-        )
+        missed = f"misses the target by {format_mm(plan.error_mm)} (limit {format_mm(TARGET_RADIUS_MM)}), limited by"
+        why = plan.summary if plan.refusal else f"{missed} {plan.limit}"
+        raise RunError(f"plan {why}; to insert anyway: flexneedle insert --force (force=True)")
     task = controller_tables.make_task(
         chosen, Simulator(with_controller_defaults(scenario, chosen), choices.threads), plan
     )

@@ -30,8 +30,9 @@ def elite_count(samples: int, fraction: float) -> int:
 class Search:
     """N samples, the elite ρN of them, most iterations; smoothing β: share of the old moments that is kept.
 
-    tolerance: spread of the elite costs, relative to the first finite one, at which the search has converged. usual:
-    from this iteration on it has also converged once ten iterations lowered the best cost by no more than that.
+    tolerance: spread of the elite costs, relative to `scale` (default: the first finite spread), at which the search
+    has converged. usual: from this iteration on it has also converged once ten iterations lowered the best cost by no
+    more than that.
     """
 
     samples: int
@@ -40,6 +41,7 @@ class Search:
     smoothing: float
     tolerance: float
     usual: int | None = field(default=None, kw_only=True)
+    scale: float | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,8 @@ def _elite_spread(entry: dict[str, Any]) -> float:
 def _has_converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
     """Return whether the elite's costs are within tolerance, or the best cost fell by less in ten iterations."""
     spreads = [_elite_spread(entry) for entry in history]
-    little = settings.tolerance * next((spread for spread in spreads if np.isfinite(spread)), np.inf)
+    first = next((spread for spread in spreads if np.isfinite(spread)), np.inf)
+    little = settings.tolerance * (first if settings.scale is None else settings.scale)
     if not np.isfinite(little):
         return False
     if spreads[-1] <= little:

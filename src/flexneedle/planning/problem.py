@@ -48,20 +48,23 @@ class PlanProblem:
     # changes of point and slope of an entry within `lateral_travel`
     home: tuple[complex, complex] = (0.0, 0.0)
     left: complex = 0.0  # vector y + iz from the nearest axis that is permitted to the target
-    energy: float = 0.0  # E₁ (mJ), of all tissue down to the target displaced by 1 mm
-    loads: LoadLimits = NO_LIMITS
+    energy_scale: float = 0.0  # E₁ (mJ), of all tissue down to the target displaced by 1 mm
+    loads: LoadLimits = NO_LIMITS  # limits of the guard
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """Terms of the cost. A roll before the first step is not charged."""
-        weights, depth = PLAN.weights(self.settings), self.target[0]
-        for name in ("end energy", "mean energy", "peak energy"):
-            weights[name] = weights[name] / self.energy if self.energy > 0.0 else 0.0
-        weights["deflection"] /= depth
-        weights["guide"] *= depth
-        loads = self.loads
+        """Terms of the cost (mm). A roll before the first step is not charged; a force without a limit is no term."""
+        depth, loads = self.target[0], self.loads
+        per_energy = 1.0 / self.energy_scale if self.energy_scale > 0.0 else 0.0
+        scales = dict.fromkeys(("end energy", "mean energy", "peak energy"), per_energy)
+        scales |= {"deflection": 1.0 / depth, "guide": depth}
+        weights = {
+            name: weight * scales.get(name, 1.0) for name, weight in PLAN.weights(self.settings).items()
+        }
+        weights["guide force"] = weights["limits"]
         limits = {"strain": loads.strain, "compression": float(loads.compression.min()), "force": loads.force}
-        return PLAN.terms(self.settings, weights, target=self.target, first=1, **limits)
+        terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **limits)
+        return tuple(term for term in terms if term.name != "guide force" or np.isfinite(loads.force))
 
     @property
     def entry_coordinates(self) -> int:
@@ -148,6 +151,6 @@ def make_problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
         left=toward - point - slope * goal[0],
         axis=axis,
         mounts=(scenario.start_base_x, setup.guide_x or 0.0),
-        energy=scenario.energy_scale(goal[0]),
+        energy_scale=scenario.energy_scale(goal[0]),
         loads=LoadLimits.of(scenario),
     )

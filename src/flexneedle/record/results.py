@@ -213,6 +213,8 @@ def plan_result(plan: Plan) -> dict[str, Any]:
             "tip_mm": plan.tip_mm,
             "error_mm": plan.error_mm,
             "reached": bool(plan.reached),
+            "limit": plan.limit,
+            "refusal": plan.refusal,
             "entry": entry,
             "cost": plan.cost,
             "terms": plan.terms,

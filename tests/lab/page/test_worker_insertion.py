@@ -282,7 +282,7 @@ def test_a_plate_distorts_the_readings_until_it_is_removed(environment, in_field
     assert environment != "ideal" or free_rows == rows_of(in_field)[:6]
     near = plain(disturbed({"what": "plate", "size": 60.0}, scenario=scenario, rows=6).rows)
     assert near[3]["indicator"] > 1.2 * free_rows[3]["indicator"]
-    assert abs(near[3]["measured"][1] - free_rows[3]["measured"][1]) > 0.1
+    assert math.dist(near[3]["measured"], free_rows[3]["measured"]) > 0.1
     brought, removed = ({"what": "plate", "size": size} for size in (60.0, 0.0))
     away = disturbed(brought, removed, scenario=scenario, rows=6)
     without = [

@@ -80,7 +80,7 @@ def check_estimate(scenario, strategy="manipulation"):
 def test_an_estimate_comes_near_a_far_target_that_a_plan_reaches_and_denies_none(name, target):
     estimated, planned = check_estimate(aimed(name, target))
     assert planned < 1.0
-    assert estimated < 1.5
+    assert estimated < 1.75
 
 
 @pytest.mark.long

@@ -79,6 +79,7 @@ NAMED = [  # settings of a study, modules that it names
 ]
 
 
+@pytest.mark.filterwarnings("ignore:plan.own_terms. the cost of a plan is in mm now")
 @pytest.mark.parametrize(("settings", "modules"), NAMED)
 def test_the_modules_of_all_custom_parts_are_recorded(here, settings, modules):
     preset = (Path(flexneedle.__file__).parent / "scenario" / "presets" / "phantom.toml").read_text()

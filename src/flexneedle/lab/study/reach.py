@@ -18,7 +18,7 @@ from flexneedle.types import Control, Point, X, Y, Z
 _ONLY_THE_MISS = {f"plan.{key}": value for key, value in PLAN.only("miss").items()}
 _SEARCHES = ((48, 10), (160, 25))
 """Samples and iterations: the second search, 14 times the longest decision of the default controller, is made if the
-first one misses. The planner makes each of them again, with wider samples, if its plan misses by more than 1 mm."""
+first one misses. After each of them the planner makes others of this size if its plan misses by more than 0.1 mm."""
 _NEAR_MM = 0.05  # a miss that is as good as none
 _DIRECTIONS = 6
 """Constant directions of the bevel, all around; on an arc one more, with both of its ends."""
@@ -33,7 +33,7 @@ def compute_reach(
     """Return the smallest miss (mm) of an ideal controller in the insertion of a seed, to about 0.5 mm.
 
     strategy: strategy of the plans, "manipulation" or "steering". If the guide moves on all lateral axes, or the base
-    may move: the miss of the best plan of up to 8960 rollouts on the model with the phantom's true parameters; the
+    may move: the miss of the best plan, weighing the miss alone, on the model with the phantom's true parameters; the
     search ends with a miss of 0.05 mm. If neither moves: distance from the target to the convex hull of the end points
     of the plant inserted with the bevel in constant directions; by rolls between them all points in it can be reached.
     If the guide of a needle in space moves along y only: both, the miss of the best plan to a target on the needle's

@@ -64,7 +64,7 @@ class PlanSettings(Section):
     primitives: int = count(6, least=1, most=1_000)
     """Primitives per control sequence, each constant over its share of the travel."""
     tolerance: Positive = 1e-3
-    """Spread of the elite's costs at convergence, relative to the first iteration."""
+    """Spread of the elite's costs at convergence, relative to 3 mm; of `ce-mpc`, relative to the first iteration."""
     advance_sigma_mm: NonNegative = 0.03
     """Initial standard deviation of the advance per step; 0: fixed."""
     guide_sigma_mm: NonNegative = 0.06
@@ -77,18 +77,20 @@ class PlanSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _drop_old_weights(cls, values: Any) -> Any:
-        """Return the values without weights of the cost before it was a length; a ScenarioWarning names them.
+        """Return the values without the weights of the earlier cost, which was no length; a ScenarioWarning names them.
 
-        For version 0.1 only.
+        Another warning is about the weights of own terms. Both are for one version.
         """
         if not isinstance(values, Mapping):
             return values
         if old := [key for key in values if key in _OLD_WEIGHTS]:
-            keys = ", ".join(f"plan.{key}" for key in old)
-            line = f"{keys}: no longer used, since the cost of a plan is a length: see plan.peak_energy_weight_mm"
+            keys, weights = ", ".join(f"plan.{key}" for key in old), ", ".join(w.key for w in PLAN.settings())
+            line = f"{keys}: not used, since the cost of a plan is in mm now; its weights: {weights}"
             warnings.warn(line, ScenarioWarning, stacklevel=2)
-        if values.get("own_terms"):
-            line = "plan.own_terms: weights give mm now; before, a miss of 1 mm had a cost of 20"
+        if isinstance(values.get("own_terms"), list | tuple):
+            line = (
+                "plan.own_terms: the cost of a plan is in mm now; divide weights of an older scenario by 20"
+            )
             warnings.warn(line, ScenarioWarning, stacklevel=2)
         return {key: value for key, value in values.items() if key not in _OLD_WEIGHTS}
 

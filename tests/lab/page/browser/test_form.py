@@ -95,11 +95,11 @@ def test_every_value_and_table_of_a_scenario_has_a_field_and_is_found_by_a_searc
     units = {"mm", "mrad", "rad", "deg", "kpa", "gpa", "mn", "mj", "hz", "per"}
     left = {key for key, (label, _) in labels.items() if units & set(label.lower().split())}
     assert left == {"tracker.jitter_per_axis"} & set(labels)
-    search(page, "flip weight")
-    page.wait_for_selector("#field-plan-flip_weight")
+    search(page, "bend weight")
+    page.wait_for_selector("#field-plan-bend_weight")
     visible = f"{FORM} .field[data-key]:visible"
     assert page.locator(visible).evaluate_all("all => all.map((one) => one.dataset.key)") == [
-        "plan.flip_weight"
+        "plan.bend_weight"
     ]
     assert "1 setting" in page.inner_text(FORM)
     shown = f"{FORM} .options input:visible, {FORM} .options select:visible"

@@ -1,0 +1,51 @@
+"""Weights of a plan before its cost was a length: dropped or reported, never silently of another meaning."""
+
+import pytest
+
+import flexneedle
+from flexneedle.errors import ScenarioError, ScenarioWarning
+from flexneedle.scenario.files import dump_scenario
+
+PHANTOM = flexneedle.load_scenario("phantom")
+OLD = {
+    "plan.accuracy_weight_per_mm": 20.0,
+    "plan.energy_weight_per_mj": 5.0,
+    "plan.deflection_weight": 0.002,
+    "plan.guide_weight": 1.0,
+    "plan.flip_weight": 0.3,
+}
+
+
+@pytest.mark.parametrize("key", OLD)
+def test_an_old_weight_is_dropped_with_a_warning(key):
+    with pytest.warns(ScenarioWarning, match=f"^{key}: not used, .*peak_energy_weight_mm"):
+        assert PHANTOM.with_values({key: 7.0}) == PHANTOM
+
+
+def test_a_file_with_old_weights_is_read_with_one_warning_of_them_all(tmp_path):
+    values = PHANTOM.values()
+    (tmp_path / "old.toml").write_text(
+        dump_scenario(PHANTOM).replace("[plan]\n", "[plan]\nflip_weight = 0.3\nguide_weight = 1\n")
+    )
+    with pytest.warns(ScenarioWarning) as caught:
+        found = flexneedle.load_scenario(tmp_path / "old.toml")
+    assert found.values() == values
+    assert [str(one.message).partition(":")[0] for one in caught] == ["plan.flip_weight, plan.guide_weight"]
+
+
+def test_an_old_weight_is_no_key_of_another_section():
+    with pytest.raises(ScenarioError, match="flip_weight"):
+        PHANTOM.with_values({"control.flip_weight": 1.0})
+
+
+def charge_nothing(trajectories):
+    return 0.0 * trajectories.energy[:, 0]
+
+
+def test_the_weights_of_own_terms_are_reported():
+    listed = [{"term": charge_nothing, "weight": 1.0}]
+    with pytest.warns(
+        ScenarioWarning, match=r"^plan\.own_terms: .* in mm now; divide weights of an older scenario by 20"
+    ):
+        made = PHANTOM.with_values({"plan.own_terms": listed})
+    assert made.plan.own_terms[0].weight == 1.0
