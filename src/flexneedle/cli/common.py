@@ -51,7 +51,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SCENARIO",
         nargs="?",
         default="phantom",
-        help="preset name, world:NUMBER or path of a scenario (default: phantom)",
+        help="preset name, wide:NUMBER, world:NUMBER or path of a scenario (default: phantom)",
     )
     parser.add_argument(
         "--target",

@@ -42,9 +42,9 @@ def _add_show(commands: Commands) -> None:
         "print a scenario with all its defaults, as TOML",
         _show,
         "flexneedle scenario show phantom > mine.toml",
-        "flexneedle scenario show world:100012:perfect",
+        "flexneedle scenario show wide:100012:perfect",
     )
-    parser.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
+    parser.add_argument("scenario", metavar="SCENARIO", help="preset name, wide:NUMBER, world:NUMBER or path")
     _add_controller(parser)
 
 
@@ -59,7 +59,7 @@ def _add_check(commands: Commands) -> None:
         about="Check a scenario. Prints one line per problem (exit status 2) and a warning for each unused "
         "or implausible value (exit status 0).",
     )
-    parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
+    parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name, wide:NUMBER or world:NUMBER")
     _add_controller(parser)
     parser.add_argument("--strict", action="store_true", help="exit status 2 for warnings too")
 

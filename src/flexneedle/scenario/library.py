@@ -116,8 +116,6 @@ PRESETS = Library("a scenario file", "preset", files(__package__) / "presets", S
 """The scenarios that come with the package."""
 WORLD_KINDS = ("world", "wide")
 """Kinds of worlds. A name is a kind, a colon, the number and, unless the case is `real`, a colon and the case."""
-WORLD = "world:"
-"""Prefix of the name of a world of the first kind."""
 
 
 def is_world(name: str) -> bool:

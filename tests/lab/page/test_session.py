@@ -102,11 +102,12 @@ def test_a_preset_or_world_begins_a_new_scenario(session, tmp_path, monkeypatch)
     begun = session.edit_scenario({"target.depth_mm": 35.0}).with_preset("phantom3d")
     assert (begun.describe().changed, begun.name) == ([], "phantom3d")
     assert begun.revision == session.revision + 2
-    assert session.with_preset("world:7").scenario == load_scenario("world:7")
+    for world in ("world:7", "wide:7:structure"):
+        assert session.with_preset(world).scenario == load_scenario(world)
     for file in ("case", "case.toml"):
         (tmp_path / file).write_text(dump_scenario(session.scenario))
     monkeypatch.chdir(tmp_path)
-    for name in ("case", "case.toml", "../case.toml", "world:x", "world:7:nonsense"):
+    for name in ("case", "case.toml", "../case.toml", "world:x", "wide:7:nonsense"):
         with pytest.raises(Refusal):
             session.with_preset(name)
 
@@ -159,7 +160,7 @@ def given_back(session):
     )
 
 
-@pytest.mark.parametrize("name", ["phantom", "phantom3d", "world:7", "world:100012"])
+@pytest.mark.parametrize("name", ["phantom", "phantom3d", "world:7", "wide:100012"])
 def test_a_session_is_restored_from_its_message(session, name):
     lost = session.with_preset(name).edit_scenario({"target.depth_mm": 33.0, "tissue.0.alpha": 9.0})
     lost = lost.with_targets(TargetsRequest(type="targets", what="add", name="Deep"))

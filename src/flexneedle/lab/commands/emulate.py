@@ -98,7 +98,9 @@ def _add_rig(commands: Commands) -> None:
         "per event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
     )
     rig.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
-    rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")
+    rig.add_argument(
+        "scenario", metavar="SCENARIO", help="preset name, wide:NUMBER, world:NUMBER or path of a scenario"
+    )
     add_seed(rig, "seed of phantom and noise, as in flexneedle insert --seed N")
     rig.add_argument(
         "--plan",

@@ -42,7 +42,7 @@ def add_parser(commands: Commands) -> None:
         metavar="SCENARIO",
         nargs="?",
         default="phantom",
-        help="preset name, world:NUMBER or path of the scenario to begin with (default: phantom)",
+        help="preset name, wide:NUMBER, world:NUMBER or path of the scenario to begin with (default: phantom)",
     )
     parser.add_argument(
         "--rig",

@@ -54,7 +54,7 @@ class RestRequest(ClientRequest):
 
 
 class PresetRequest(ClientRequest):
-    """Begin with a preset, or with a random world such as "world:7"."""
+    """Begin with a preset, or with a random world such as "wide:7"."""
 
     type: Literal["preset"]
     name: Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[a-z0-9][a-z0-9:-]*$")]

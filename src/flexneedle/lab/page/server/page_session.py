@@ -16,7 +16,7 @@ from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.page.server.named_targets import NamedTargets
 from flexneedle.scenario.dotted import nest, split_key
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.library import PRESETS, WORLD, parse_toml
+from flexneedle.scenario.library import PRESETS, is_world, parse_toml
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.plausible import find_doubts
 from flexneedle.scenario.sections.needle import GAUGES, Needle
@@ -68,7 +68,7 @@ class PageSession:
         """Return the session with a preset or random world. Raises Refusal."""
         if not _is_preset(name):
             choices = ", ".join(PRESETS.names())
-            raise Refusal(f"preset = {name}: must be one of {choices}, or {WORLD}NUMBER")
+            raise Refusal(f"preset = {name}: must be one of {choices}, wide:NUMBER or world:NUMBER")
         with _refuse_problems():
             return self._begin(name, load_scenario(name), ())
 
@@ -167,7 +167,7 @@ class PageSession:
 
 def _is_preset(name: str) -> bool:
     """Return whether a name is one of a preset or a random world."""
-    return name in PRESETS.names() or name.startswith(WORLD)
+    return name in PRESETS.names() or is_world(name)
 
 
 def _cross_section(needle: Needle, values: Mapping[str, Any]) -> dict[str, Any]:
