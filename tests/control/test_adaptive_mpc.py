@@ -109,7 +109,8 @@ def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, al
         estimate = estimate_of(state)
         off = sd * np.sqrt(estimate.reading_variance)
         move = Move(Motion(command, 0.0, 1.0), (Measurement(measured, *state.tip[:2].tolist()),))
-        estimate = replace(estimate, innovation=(0.0, off, 0.0), moves=(move,))
+        tips = np.array([state.tip, state.tip])
+        estimate = replace(estimate, innovation=(0.0, off, 0.0), moves=(move,), tips=tips)
         return decide(quick_plan, estimate).rest
 
     inside = along(quick_plan, 40)

@@ -1,16 +1,23 @@
-"""The needle's advance along its axis: a start error and a scale, fitted to all readings."""
+"""The needle's advance along its axis: start error, scale and play, fitted to all readings."""
 
 import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.estimation.axial import axial_variance, fit_axial_error, fit_even_advance
+from flexneedle.estimation.axial import (
+    axial_variance,
+    fit_axial_error,
+    fit_even_advance,
+    play_prior,
+    rest_variance,
+)
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, Control, Measurement, Motion, X
 from tasks import begun_with
 
+PHANTOM = flexneedle.load_scenario("phantom")
 SCENARIOS = {
     name: flexneedle.load_scenario(name).with_values({"tracker.jitter_mm": 0.05})
     for name in ("phantom", "phantom3d")
@@ -45,29 +52,78 @@ def test_the_depth_of_the_tip_is_the_trackers_whatever_the_axis_makes_of_a_comma
     assert estimate.state.travel[DB_X] == pytest.approx(50.0, abs=1e-9)
 
 
+ADVANCES = np.arange(12) % 4 > 0  # every fourth move is a rest in tissue
+
+
+def columns_of(travel, *others):
+    return np.stack([np.ones_like(travel), travel, *others])
+
+
 def test_the_fit_is_the_least_squares_solution_with_the_prior():
+    """The play is a parameter beside the error of the start: at rest the needle is behind by it."""
     rng = np.random.default_rng(1)
-    travel, variance, sds = np.arange(12.0), rng.uniform(0.01, 0.1, 12), np.array([1.0, 0.01])
-    ahead = 0.3 + 0.02 * travel + rng.normal(0.0, 0.1, 12)
+    travel, variance, sds = np.arange(12.0), rng.uniform(0.01, 0.1, 12), np.array([1.0, 0.01, 0.3])
+    ahead = 0.3 + 0.02 * travel - 0.5 * ~ADVANCES + rng.normal(0.0, 0.1, 12)
     rows = np.concatenate(
-        [np.stack([np.ones(12), travel], axis=1) / np.sqrt(variance)[:, None], np.diag(1.0 / sds)]
+        [columns_of(travel, -1.0 * ~ADVANCES).T / np.sqrt(variance)[:, None], np.diag(1.0 / sds)]
     )
-    right = np.append(ahead / np.sqrt(variance), [0.0, 0.0])
-    found, covariance = fit_axial_error(ahead, travel, variance, np.diag(sds**2))
-    np.testing.assert_allclose(found, np.linalg.lstsq(rows, right, rcond=None)[0], rtol=1e-9)
-    np.testing.assert_allclose(covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
-    known, _ = fit_axial_error(ahead, travel, variance, np.zeros((2, 2)))
+    right = np.append(ahead / np.sqrt(variance), np.zeros(3))
+    start, scale, play = np.linalg.lstsq(rows, right, rcond=None)[0]
+    found, covariance = fit_axial_error(
+        ahead, columns_of(travel, ADVANCES), variance, play_prior(PHANTOM.control)
+    )
+    np.testing.assert_allclose(found, [start - play, scale, play], rtol=1e-9)
+    inverse = np.linalg.inv(rows.T @ rows)
+    for columns, sensitivity in (((1.0, 7.0, 0.0), [1.0, 7.0, -1.0]), ((1.0, 7.0, 1.0), [1.0, 7.0, 0.0])):
+        assert axial_variance(covariance, columns) == pytest.approx(sensitivity @ inverse @ sensitivity)
+    known, _ = fit_axial_error(ahead, columns_of(travel), variance, np.zeros((2, 2)))
     assert known.tolist() == [0.0, 0.0]
-    sensitivity = np.array([1.0, 7.0])
-    assert axial_variance(covariance, 7.0) == pytest.approx(sensitivity @ covariance @ sensitivity)
+
+
+def test_a_shallow_rest_or_a_roll_does_not_show_the_whole_play():
+    depth, turns = np.array([0.0, 5.0, 10.0, 40.0, 40.0]), np.array([False, False, False, False, True])
+    np.testing.assert_allclose(rest_variance(depth, turns), [0.09, 0.0225, 0.0, 0.0, 0.09])
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.1, -1.0, 25.4])
 def test_an_even_advance_has_any_scale_and_readings_that_jump_have_none(scale):
     travel, prior = np.arange(12.0), np.diag([1.0, 1e-4])
     noise = np.full(12, 1e-4)
-    found = fit_even_advance(0.3 + (scale - 1.0) * travel, travel, noise, prior)
+    columns = columns_of(travel)
+    found = fit_even_advance(0.3 + (scale - 1.0) * travel, columns, noise, prior)
     assert found.scale == pytest.approx(scale, abs=1e-3)
     assert found.misfit < 1e-3
-    jump = fit_even_advance(0.3 + (scale - 1.0) * travel - 0.6 * (travel > 6.0), travel, noise, prior)
+    jump = fit_even_advance(0.3 + (scale - 1.0) * travel - 0.6 * (travel > 6.0), columns, noise, prior)
     assert jump.misfit == pytest.approx(0.6 * np.sqrt(1 / 4 - 3 / 16 * 144 / 143), abs=0.03)
+
+
+def test_an_advance_with_play_is_even():
+    travel, noise = np.arange(12.0), np.full(12, 1e-4)
+    ahead = 0.3 + 0.1 * travel - 0.8 * ~ADVANCES
+    found = fit_even_advance(ahead, columns_of(travel, ADVANCES), noise, play_prior(PHANTOM.control))
+    assert found == pytest.approx((1.1, 0.0), abs=2e-3)
+    assert fit_even_advance(ahead, columns_of(travel), noise, np.diag([1.0, 1e-4])).misfit > 0.3
+
+
+@pytest.mark.parametrize("play", [0.6, -0.1])
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_the_play_is_found_from_rests_in_tissue(name, play):
+    """The model's needle is at rest; in motion and in air the tip is ahead on its path by the play."""
+    simulator, lateral = Simulator(SCENARIOS[name], 1), SCENARIOS[name].setup.axes + 1
+    estimate, truth = Identification().begin(begun_with(simulator)), simulator.start()
+    for k in range(60):
+        command = Control() if k in (10, 45, 52, 57) else Control(db_x=1.0, dg_y=0.12 * (k < 50))
+        before, truth = truth.tip, simulator.replay(truth, np.array([command]))[0]
+        moves_on = k not in (45, 52, 57)
+        tips = {part: (1.0 - part) * before + part * truth.tip for part in (0.5, 1.0)}
+        seen = {k + part: tip[:3] + play * moves_on * np.array([1.0, *tip[3:]]) for part, tip in tips.items()}
+        estimate = estimate.move(Motion(command, float(k), k + 1.0))
+        estimate = estimate.observe([Measurement(at, *tip[:lateral].tolist()) for at, tip in seen.items()])
+        np.testing.assert_allclose(estimate.measured[:lateral], seen[k + 1.0][:lateral], atol=0.02)
+        if k >= 57:
+            np.testing.assert_allclose(estimate.tip[:lateral], seen[k + 1.0][:lateral], atol=0.02)
+            assert estimate.state.tip[X] == pytest.approx(truth.tip[X], abs=0.02)
+            assert estimate.play == pytest.approx(play, abs=0.02)
+            assert estimate.even_advance == pytest.approx((1.0, 0.0), abs=0.02)
+    assert truth.tip[3] > 0.09
+    assert estimate.tip_at(59.5)[0] == pytest.approx(seen[59.5][X], abs=0.02)

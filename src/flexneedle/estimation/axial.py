@@ -1,12 +1,16 @@
-"""Advance of the needle along its axis, as the tracker measures it: a start error and a scale.
+"""Advance of the needle along its axis, as the tracker measures it: a start error, a scale, and a play.
 
-Axial motion is rigid, so that both act on all depths alike. The scale is the ratio of the measured to the commanded
-advance: the error of the insertion axis in the rig file, or of the tracker.
+Axial motion is rigid, so that they act on all depths alike. The scale is the ratio of the measured to the commanded
+advance: the error of the insertion axis in the rig file, or of the tracker. Where the advance stops in tissue, the
+needle springs back by the play. States and tips of a model with play are of the needle at rest: the tip in motion is
+ahead by the play, and so is the tip in air.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.simulator import Simulator
@@ -14,6 +18,8 @@ from flexneedle.simulator.state import State
 from flexneedle.types import DB_X, Control, Floats
 
 _ANY_SCALE = 100.0  # standard deviation of a scale that may have any value
+_PLAY_SD = 0.3  # mm; prior standard deviation of the play
+_FULL_PLAY = 10.0  # mm; depth from which a rest shows the whole play, since the tissue pushes the needle back
 
 
 def axial_prior(control: ControlSettings) -> Floats:
@@ -21,20 +27,41 @@ def axial_prior(control: ControlSettings) -> Floats:
     return np.diag([control.start_axial_sd_mm**2, control.axial_scale_sd**2])
 
 
-def axial_variance(covariance: Floats, travel: float) -> float:
-    """Return the variance (mm²) of the needle's depth after an advance of `travel` (mm)."""
-    return float(covariance[0, 0] + 2.0 * travel * covariance[0, 1] + travel**2 * covariance[1, 1])
+def play_prior(control: ControlSettings) -> Floats:
+    """Return the prior covariance (3, 3) of the start error (mm) of a needle at rest, the scale, and the play (mm).
 
-
-def fit_axial_error(ahead: Floats, travel: Floats, variance: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """Return the maximum a posteriori (2,) of the start error (mm) and of the scale's error, and their covariance.
-
-    ahead (r,): readings minus predictions without both, mm, of `variance` (r,); travel (r,): commanded advance, mm;
-    prior: its covariance (2, 2), with means 0.
+    The error at rest is the independent error of the start minus the play.
     """
-    columns = np.stack([np.ones_like(travel), travel])
+    prior = np.zeros((3, 3))
+    prior[:2, :2] = axial_prior(control)
+    prior[::2, ::2] += _PLAY_SD**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    return prior
+
+
+def rest_variance(depth: Floats, turns: NDArray[np.bool_]) -> Floats:
+    """Return the variance (r,), mm², of the play at rests of the tip at a depth (mm), which may not be the whole play.
+
+    turns: whether the needle rolls, at whose start it may not have sprung back yet.
+    """
+    missing: Floats = np.where(turns, 1.0, np.clip(1.0 - depth / _FULL_PLAY, 0.0, 1.0))
+    return (_PLAY_SD * missing) ** 2
+
+
+def axial_variance(covariance: Floats, derivatives: Sequence[float]) -> float:
+    """Return the variance (mm²) of the needle's depth, with its derivatives (p,) as for `fit_axial_error`."""
+    return float(derivatives @ covariance @ derivatives)
+
+
+def fit_axial_error(ahead: Floats, columns: Floats, variance: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    """Return the maximum a posteriori (p,) of the axial errors, and their covariance (p, p).
+
+    ahead (r,): readings minus predictions without errors, mm, of `variance` (r,); columns (p, r): their derivatives to
+    the start error (mm) and the scale: 1 and the commanded advance (mm), and to the play: 1 or, at rest, 0;
+    prior: its covariance (p, p), with means 0.
+    """
     weighted = columns / variance
-    covariance: Floats = prior @ np.linalg.inv(np.eye(2) + weighted @ columns.T @ prior)  # a prior of 0 stays
+    information = weighted @ columns.T
+    covariance: Floats = prior @ np.linalg.inv(np.eye(len(prior)) + information @ prior)  # a prior of 0 stays
     return covariance @ (weighted @ ahead), covariance
 
 
@@ -52,12 +79,13 @@ AS_COMMANDED = EvenAdvance(1.0, 0.0)
 """Advance before any reading."""
 
 
-def fit_even_advance(ahead: Floats, travel: Floats, variance: Floats, prior: Floats) -> EvenAdvance:
+def fit_even_advance(ahead: Floats, columns: Floats, variance: Floats, prior: Floats) -> EvenAdvance:
     """Return the even advance that fits readings; arguments as for `fit_axial_error`."""
-    wide = np.diag([prior[0, 0], _ANY_SCALE**2])
-    start, scale = fit_axial_error(ahead, travel, variance, wide)[0].tolist()
-    left = ahead - start - scale * travel
-    return EvenAdvance(1.0 + scale, float(np.sqrt(np.mean(left**2))) if len(left) else 0.0)
+    wide = prior.copy()
+    wide[1, 1] = _ANY_SCALE**2
+    found, _ = fit_axial_error(ahead, columns, variance, wide)
+    left = ahead - found @ columns
+    return EvenAdvance(1.0 + float(found[1]), float(np.sqrt(np.mean(left**2))) if len(left) else 0.0)
 
 
 def carry_out(simulator: Simulator, state: State, applied: Control, axial_scale: float = 1.0) -> State:

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.estimation.axial import scale_advance
 from flexneedle.estimation.lateral import components, from_components
@@ -16,7 +17,7 @@ from flexneedle.estimation.sensors import Sensor, sensors_of
 from flexneedle.mechanics.model import Adaptation, Model, adapt
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import STILL, THETA, Floats, Laterals, Y, Z, laterals
+from flexneedle.types import DB_X, STILL, THETA, Floats, Laterals, X, Y, Z, laterals
 
 _REST = np.array([STILL])
 _OF_MOVES = (
@@ -62,8 +63,9 @@ class FittedInsertion:
     grid: Floats  # depths of the tip (g,), mm
     curves: Laterals  # derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first
     precision: Floats  # inverse covariance (K, K) of the parameters
-    axial: float = 0.0  # start error along the axis (mm)
+    axial: float = 0.0  # start error along the axis (mm), of the needle at rest in tissue
     axial_scale: float = 1.0  # advance of the needle over the commanded advance
+    play: float = 0.0  # spring-back along the axis at rest in tissue (mm)
     period: int = 0
     # the present needle with one parameter changed, for some parameters
     perturbed: tuple[Perturbed, ...] = ()
@@ -83,6 +85,18 @@ class FittedInsertion:
     def rows(self) -> Floats:
         """The commands of the moves (m, 9)."""
         return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, len(STILL))
+
+    @cached_property
+    def moves_on(self) -> NDArray[np.bool_]:
+        """Whether each move (m,) advances, or ends in air: its readings are ahead of a needle at rest by the play."""
+        moves_on: NDArray[np.bool_] = (self.rows[:, DB_X] > 0.0) | (self.tips[1:, X] <= 0.0)
+        return moves_on
+
+    @property
+    def lead(self) -> Floats:
+        """Axial distance (m,), mm, in each move from the model's tip, which is at rest, to the measured one."""
+        lead: Floats = np.where(self.moves_on, self.play, 0.0)
+        return lead
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
@@ -110,13 +124,24 @@ class FittedInsertion:
 
     @cached_property
     def residuals(self) -> list[Laterals]:
-        """Lateral residuals (r,) of each sensor: readings minus the model's quantities."""
-        return [
+        """Lateral residuals (r,) of each sensor: readings minus the model's quantities.
+
+        A tip in motion is ahead on its path, which bends little over the play.
+        """
+        residuals = [
             readings.compute_residuals(
                 tips, from_components(self.parameters[getattr(self.slots, sensor.offset)])
             )
             for sensor, readings, tips in zip(self.sensors, self.readings, self.laterals, strict=True)
         ]
+        position = self.readings[0]
+        residuals[0] -= self.lead[position.index] * position.between(self.slope)
+        return residuals
+
+    @cached_property
+    def slope(self) -> Laterals:
+        """Slopes (m + 1,) of the tips."""
+        return laterals(self.tips, THETA, self.axes)
 
     def slopes(self, depth: Floats, sensor: int = 0) -> Laterals:
         """Return derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""

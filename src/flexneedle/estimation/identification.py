@@ -8,8 +8,9 @@ takes a millisecond, and compared with the lateral readings. Parameters, with no
     ln of the factor on each layer's modulus, shift (mm) of each boundary between layers,
     ln of a further factor on the modulus in cells along the depth, correlated over a length.
 
-So tissue ahead of the tip is estimated as far as it is correlated with the tissue behind it. The start along the axis
-is a shift of all axial readings, fitted separately. The residuals of the fit are low-passed and added as a constant.
+So tissue ahead of the tip is estimated as far as it is correlated with the tissue behind it. Start, scale and play of
+the advance along the axis are fitted separately, to the axial readings. The residuals of the lateral fit are low-passed
+and added as a constant.
 """
 
 import cmath
@@ -23,11 +24,12 @@ import numpy as np
 from flexneedle.estimation.axial import (
     AS_COMMANDED,
     EvenAdvance,
-    axial_prior,
     axial_variance,
     fit_axial_error,
     fit_even_advance,
+    play_prior,
     replay_scaled,
+    rest_variance,
 )
 from flexneedle.estimation.estimate import describe_estimate
 from flexneedle.estimation.fit import ROUND, differentiate, improve_fit, simulate_due
@@ -37,7 +39,7 @@ from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.types import DB_X, STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z
+from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Point, X, Z
 
 _RECENT = 12  # moves whose residuals are low-passed
 
@@ -70,7 +72,7 @@ class Identification:
                 dtype=float if scenario.setup.axes == 1 else complex,
             ),
             prior.precision,
-            axial_covariance=axial_prior(scenario.control),
+            axial_covariance=play_prior(scenario.control),
         )
         return differentiate(start, simulate_due(start, prior.mean, range(prior.mean.size)))
 
@@ -80,8 +82,8 @@ class Identified(FittedInsertion):
     """An `Estimate` with fitted parameters."""
 
     axial_covariance: Floats = field(
-        default_factory=lambda: np.zeros((2, 2))
-    )  # of axial (mm) and axial_scale
+        default_factory=lambda: np.zeros((3, 3))
+    )  # of axial (mm), axial_scale and play (mm)
     even_advance: EvenAdvance = AS_COMMANDED
     residual: complex = 0.0  # low-passed residual (mm)
     innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
@@ -95,8 +97,8 @@ class Identified(FittedInsertion):
     def tip(self) -> Floats:
         """Tip pose (5,) as measured: the model's, plus the tip's offset from the needle's axis."""
         tip, off = self.state.tip, self.off_axis(self.state.bevel)
-        tip[Y] += off.real
-        tip[Z] += off.imag
+        lead = self.lead[-1] if self.moves else 0.0
+        tip[: Z + 1] += [lead, lead * tip[THETA] + off.real, lead * tip[PSI] + off.imag]
         return tip
 
     @property
@@ -110,7 +112,7 @@ class Identified(FittedInsertion):
 
     def tip_at(self, time: float) -> Point:
         """Return the estimated position of the tip (mm) at `time`."""
-        x, y, z = position_along(self.moves, self.tips, time)
+        x, y, z = position_along(self.moves, self.tips, time, self.lead)
         running = takewhile(lambda done: time < done.motion.ended, reversed(self.moves))
         left = sum(done.left_to_turn(time) for done in running)
         off = self.off_axis(self.state.bevel * cmath.exp(-1j * left))
@@ -138,31 +140,38 @@ class Identified(FittedInsertion):
         extended = replace(self, moves=assign_readings(self.moves, measurements))._fit_axially()
         readings = extended.readings[0]
         fitted = improve_fit(extended)
-        left, ahead = fitted.residuals[0], readings.ahead(fitted.tips[:, X])
+        left, lead = fitted.residuals[0], fitted.lead
+        ahead = readings.ahead(fitted.tips[:, X]) - lead[readings.index]
         newest = int(readings.index[-1]) + 1
         since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])
         bevel = fitted.state.bevel * cmath.exp(-1j * since)
-        y = complex(fitted.laterals[0][newest] + left[-1] + fitted.run_out * bevel)
+        x = float(fitted.tips[newest, X] + lead[newest - 1] + ahead[-1])
+        y = fitted.laterals[0][newest] + lead[newest - 1] * fitted.slope[newest] + left[-1]
+        y = complex(y + fitted.run_out * bevel)
         inside = fitted.tips[-1, X] > 0.0
         return fitted.change(
             residual=low_pass(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1].real), float(left[-1].imag)),
-            measured=(float(fitted.tips[newest, X] + ahead[-1]), y.real, y.imag if self.axes > 1 else 0.0),
+            measured=(x, y.real, y.imag if self.axes > 1 else 0.0),
         )
 
     def _fit_axially(self) -> "Identified":
-        """Return the estimate with the axial start error and the scale of the advance fitted to all readings."""
+        """Return the estimate with start error, scale and play along the axis fitted to all readings."""
         scenario, position, readings = self.nominal.scenario, self.sensors[0], self.readings[0]
         travel = readings.between(np.cumsum(np.append(0.0, self.rows[:, DB_X])))
         without = readings.ahead(self.tips[:, X]) + self.axial + (self.axial_scale - 1.0) * travel
         unexplained = position.unexplained(scenario, self.settings)
+        moves_on = self.moves_on[readings.index]
         variance = readings.axial_variance(position.sd(scenario) or 0.0, unexplained)
-        found, covariance = fit_axial_error(without, travel, variance, axial_prior(scenario.control))
+        variance += np.where(moves_on, 0.0, rest_variance(readings.between(self.tips[:, X]), readings.turns))
+        columns, prior = np.stack([np.ones_like(travel), travel, moves_on]), play_prior(scenario.control)
+        found, covariance = fit_axial_error(without, columns, variance, prior)
         return self.change(
             axial=float(found[0]),
             axial_scale=1.0 + float(found[1]),
+            play=float(found[2]),
             axial_covariance=covariance,
-            even_advance=fit_even_advance(without, travel, variance, axial_prior(scenario.control)),
+            even_advance=fit_even_advance(without, columns, variance, prior),
         )
 
     @cached_property
@@ -173,10 +182,13 @@ class Identified(FittedInsertion):
 
     @property
     def tip_sd(self) -> float:
-        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip, which is in motion.
+
+        At rest an unknown play would excuse lateral jumps.
+        """
         slope = self.slopes(self.state.tip[:1])[0]
         slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
-        axial = axial_variance(self.axial_covariance, float(self.state.travel[DB_X]))
+        axial = axial_variance(self.axial_covariance, (1.0, float(self.state.travel[DB_X]), 1.0))
         return float(np.sqrt(variance_of(slope, self.covariance) + axial))
 
     def shape_sd(self, nodes: Floats) -> Floats:

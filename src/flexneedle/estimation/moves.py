@@ -157,16 +157,17 @@ def _owners(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> NDA
     return owners
 
 
-def position_along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
+def position_along(moves: tuple[Move, ...], tips: Floats, time: float, lead: Floats | None = None) -> Point:
     """Return the position (mm) at `time` on the path through tips (k + 1, 5), at the ends of k moves.
 
-    Between moves the tip rests.
+    Between moves the tip rests. lead (k,): axial distance (mm) ahead of the path in each move (default: 0).
     """
     last = bisect_right(moves, time, key=lambda done: done.motion.travel_begun) - 1
     if last < 0:
         return Pose.of(tips[0]).point
     part = moves[last].part(time)
-    return Pose.of((1.0 - part) * tips[last] + part * tips[last + 1]).point
+    x, y, z = Pose.of((1.0 - part) * tips[last] + part * tips[last + 1]).point
+    return x + (0.0 if lead is None else float(lead[last])), y, z
 
 
 def _variance_of_mean(variances: Sequence[float | None]) -> float:

@@ -88,14 +88,15 @@ class Corrected:
         """
         arm = np.array([self.simulator.scenario.needle.length_mm])
         axes = self.simulator.scenario.setup.axes
-        axial = axial_variance(self.axial, float(self.state.travel[DB_X]))
+        axial = axial_variance(self.axial, (1.0, float(self.state.travel[DB_X])))
         return float(np.sqrt(axes * self._across(self.state.tip[:1], arm)[0] + axial))
 
     @property
     def even_advance(self) -> EvenAdvance:
         """Advance of a constant scale that fits the readings along the axis best, whatever the prior of the scale."""
         travel, ahead, variance = np.array(self.advances).reshape(-1, 3).T
-        return fit_even_advance(ahead, travel, variance, axial_prior(self.simulator.scenario.control))
+        columns = np.stack([np.ones_like(travel), travel])
+        return fit_even_advance(ahead, columns, variance, axial_prior(self.simulator.scenario.control))
 
     def _across(self, x: Floats, arms: Floats) -> Floats:
         """Return the variance (n,), mm², of positions on a lateral axis at x (n,), mm, `arms` (n,) from the base."""

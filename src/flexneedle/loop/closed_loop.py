@@ -235,7 +235,7 @@ def _make_period(
         roll=state.roll,
         strain_energy=state.strain_energy,
         tip_load=state.tip_load,
-        path=Pose.of(np.interp(state.tip[X], plan.tips[:, X], column) for column in plan.tips.T),
+        path=Pose.of(np.interp(estimate.tip[X], plan.tips[:, X], column) for column in plan.tips.T),
         cost=step.decision.cost,
         spread=step.decision.spread,
         action=step.action,
