@@ -19,7 +19,7 @@ def _keys(table):
 POSITIVE = _keys("""
     contact: spacing_mm
     control: depth_tolerance_mm innovation_limit_mm miss_limit_mm hold_limit_s hold_total_s stale_after_s
-    control.adaptive_mpc: variation_length_mm cell_mm least_model_sd_mm model_slope_sd_mrad
+    control.adaptive_mpc: variation_length_mm cell_mm least_model_sd_mm model_slope_sd_mrad precision_mm
     control.broyden_mpc: max_guide_travel_mm
     control.resolved_rate: lookahead_mm
     guard: guide_force_n needle_strain_percent past_target_mm
@@ -41,7 +41,7 @@ _WEIGHTS = {"plan": PLAN, "control.ce_mpc": CE_MPC, "control.adaptive_mpc": ADAP
 NOT_NEGATIVE = [f"{section}.{weight.key}" for section, cost in _WEIGHTS.items() for weight in cost.settings()]
 NOT_NEGATIVE += _keys("""
     control: load_gain start_offset_sd_mm start_angle_sd_mrad start_axial_sd_mm axial_scale_sd
-    control.adaptive_mpc: urgency unguided_reach_margin clearance_mm clearance_sd_mm model_sd bend_sd_mm
+    control.adaptive_mpc: unguided_reach_margin clearance_mm clearance_sd_mm model_sd bend_sd_mm
     control.adaptive_mpc: run_out_sd_mm tilt_sd_mrad modulus_log_sd bevel_sd boundary_sd_mm variation_sd
     control.adaptive_mpc: residual_gain
     control.bevel_only: curvature_per_m flip_dead_band

@@ -22,15 +22,13 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DG_Y, ROLL, STILL, THETA, Control, Measurement, Motion, X, Y
 from tasks import stretched, task_of
 
+ENERGIES = [f"{part}_energy_weight_mm" for part in ("end", "mean", "peak")]
 ACCURATE = PHANTOM.with_values(
-    {f"control.adaptive_mpc.{key}": 0.0 for key in ("energy_weight_mm", "line_weight", "slope_weight_mm")}
+    {f"control.adaptive_mpc.{key}": 0.0 for key in (*ENERGIES, "travel_weight", "slope_weight_mm")}
 )
 FORWARD = Control(db_x=1.0)
 ROLLING = BARE.with_values(
-    {
-        f"control.adaptive_mpc.{key}": 0.0
-        for key in ("unguided_energy_weight_mm", "roll_weight_mm", "late_roll_weight")
-    }
+    {f"control.adaptive_mpc.{key}": 0.0 for key in (*ENERGIES, "roll_weight_mm", "late_roll_weight")}
 )
 
 

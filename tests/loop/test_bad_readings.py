@@ -76,7 +76,10 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan):
         failed = [period for period in bad(done) if begin < period.time < begin + 0.7]
         first = failed[0].index
         assert [period.index for period in failed] == list(range(first, first + len(failed)))
-        assert all(str(period.verdict)[:11] == verdict[:11] for period in failed)
+        # The first reading of a displaced tip may be a jump from the one before.
+        kinds = [str(period.verdict)[:11] for period in failed]
+        assert {*kinds[1:]} == {verdict[:11]}
+        assert kinds[0] == verdict[:11] or (kinds[0][:5] == "jump:" and verdict.startswith("innovation"))
         assert failed[0].time < begin + 0.4  # a period is bad without a reading, or with a bad last one
         assert begin + 0.55 < failed[-1].time < begin + 0.65
         # The period in which it was detected had moved; then nothing moves, and no reading is assimilated.

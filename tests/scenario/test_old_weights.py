@@ -1,8 +1,9 @@
-"""Weights of a plan before its cost was a length: dropped or reported, never silently of another meaning."""
+"""Weights of earlier costs of plan and controller: dropped or reported, never silently of another meaning."""
 
 import pytest
 
 import flexneedle
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, with_controller_defaults
 from flexneedle.errors import ScenarioError, ScenarioWarning
 from flexneedle.scenario.files import dump_scenario
 
@@ -14,6 +15,10 @@ OLD = {
     "plan.guide_weight": 1.0,
     "plan.flip_weight": 0.3,
 }
+OLD_OF_CONTROLLER = [
+    *("urgency", "energy_weight_mm", "unguided_energy_weight_mm"),
+    *("line_weight", "unguided_line_weight", "reach_weight"),
+]
 
 
 @pytest.mark.parametrize("key", OLD)
@@ -36,6 +41,20 @@ def test_a_file_with_old_weights_is_read_with_one_warning_of_them_all(tmp_path):
 def test_an_old_weight_is_no_key_of_another_section():
     with pytest.raises(ScenarioError, match="flip_weight"):
         PHANTOM.with_values({"control.flip_weight": 1.0})
+
+
+@pytest.mark.parametrize("keys", [[key] for key in OLD_OF_CONTROLLER] + [OLD_OF_CONTROLLER])
+def test_old_keys_of_the_default_controller_are_dropped_with_one_warning(keys):
+    given = PHANTOM.with_values({f"control.adaptive_mpc.{key}": 7.0 for key in keys})
+    with pytest.warns(ScenarioWarning) as caught:
+        assert with_controller_defaults(given) == with_controller_defaults(PHANTOM)
+    (line,) = (str(one.message) for one in caught)
+    named = ", ".join(f"control.adaptive_mpc.{key}" for key in keys)
+    assert line.startswith(
+        f"{named}: not used, since the controller charges the energy of the whole path now; "
+    )
+    assert "travel_weight" in line
+    assert not set(keys) & set(CONTROLLERS[DEFAULT].settings.model_fields)
 
 
 def charge_nothing(trajectories):

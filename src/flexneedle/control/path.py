@@ -19,7 +19,7 @@ from flexneedle.results import Plan
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, X
+from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, Laterals, X
 
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""
@@ -34,6 +34,9 @@ _FURTHEST = 0.3  # largest move of a roll, of the path left
 _WIDEST = 1.0  # largest change of an angle (rad)
 _LEAN = 0.1  # mm
 _DECADES = 2.0  # over which the scales of the samples spread
+_FINER_DECADES = (-2.5, -0.3)  # of the scales of samples around the best
+_OVERSHOOT = 1.2  # largest share of a miss that an aimed sample undoes
+_RANK = 1e-3  # of the largest singular value of the tried corrections: smaller ones do not count
 _TURNS = 4.0 * np.pi  # from the present angle, to either side: bounds of an angle
 
 
@@ -286,8 +289,7 @@ def propose_samples(ahead: Ahead, count: int, rng: np.random.Generator, aim: com
     k, depths = ahead.knots, ahead.depths
     kind = np.arange(count) % 12
     scale = 10.0 ** rng.uniform(-_DECADES, 0.0, (count, 2))
-    widest = _STEEPEST * ahead.left + _SHARE_OF_A_STEP * ahead.step
-    guide = widest * scale[:, :1] * rng.standard_normal((count, k))
+    guide = _widest(ahead) * scale[:, :1] * rng.standard_normal((count, k))
     rolls = _FURTHEST * ahead.left * scale[:, 1:] * rng.standard_normal((count, ahead.slots))
     if ahead.step > 0.0:
         z[:, :k] += np.where(((kind < 3) | (kind >= 8))[:, None], guide, 0.0)
@@ -302,6 +304,80 @@ def propose_samples(ahead: Ahead, count: int, rng: np.random.Generator, aim: com
         _propose_angles(ahead, z, scale[:, 1:], (kind >= 3)[:, None] & used, pair, aim, rng)
     z[0] = ahead.current
     return np.clip(z, *ahead.bounds)
+
+
+def aim_samples(
+    ahead: Ahead, tried: Floats, misses: Laterals, costs: Floats, rng: np.random.Generator
+) -> Floats:
+    """Return as many samples as were tried (N, d), around the best, which is the first, and aimed at the target.
+
+    misses: y + iz (N,), mm, of the samples tried; costs: (N,). The derivative of the miss to the corrections of the
+    guide is fitted to the samples that correct the guide alone. Each new sample is a random change of the guide, and a
+    second one in a random direction, as large as undoes 0 to 1.2 of the miss by that derivative; a third of the samples
+    have only the second. An eighth have the rolls of another sample.
+    """
+    count, best = len(tried), int(np.argmin(costs))
+    lever = fit_lever(ahead, tried, misses, costs)
+    change, along = _vary_guide(ahead, count, rng)
+    miss = misses[best] if ahead.axes == 2 else misses[best].real
+    change = undo_miss(change, along, lever, rng.uniform(0.0, _OVERSHOOT, count) * miss)
+    change[0] = 0.0
+    z = np.tile(tried[best], (count, 1))
+    z[:, : ahead.knots] += np.concatenate([change.real, change.imag], axis=1)[:, : ahead.knots]
+    z[1::8, ahead.knots :] = tried[rng.integers(0, count, len(z[1::8])), ahead.knots :]
+    aimed: Floats = np.clip(z, *ahead.bounds)
+    return aimed
+
+
+def fit_lever(ahead: Ahead, tried: Floats, misses: Laterals, costs: Floats) -> Floats:
+    """Return the derivative (k,) of the miss to the corrections at the knots, the same on each axis of the guide.
+
+    It is fitted to the differences of samples from the first that have its rolls; 0 if the first has no finite cost.
+    """
+    alone = (tried[:, ahead.knots :] == tried[0, ahead.knots :]).all(axis=1) & np.isfinite(costs)
+    if not alone[0]:
+        return np.zeros(KNOTS.size)
+    rows = (tried[alone, : ahead.knots] - tried[0, : ahead.knots]).reshape(-1, KNOTS.size)
+    moved = misses[alone] - misses[0]
+    right = np.stack([moved.real, moved.imag], axis=1)[:, : ahead.axes].ravel()
+    size = np.linalg.norm(rows, axis=1)
+    used = size > 0.0
+    # By their size, since the response is less linear to larger corrections.
+    lever: Floats = np.linalg.lstsq(rows[used] / size[used, None], right[used] / size[used], rcond=_RANK)[0]
+    return lever
+
+
+def _vary_guide(ahead: Ahead, count: int, rng: np.random.Generator) -> tuple[Laterals, Floats]:
+    """Return random changes (count, k) of the guide at the knots, y or y + iz, a third of them 0, and directions.
+
+    Half of the changes and of the directions (count, k), which are positive, add up along the path.
+    """
+    shape = (count, KNOTS.size)
+    noise: Laterals = rng.standard_normal(shape)
+    if ahead.axes == 2:
+        noise = noise + 1j * rng.standard_normal(shape)
+    smooth = rng.uniform(size=(2, count, 1)) < 0.5
+    scale = _widest(ahead) * 10.0 ** rng.uniform(*_FINER_DECADES, (count, 1))
+    change: Laterals = scale * np.where(smooth[0], np.cumsum(noise, axis=1), noise)
+    change[::3] = 0.0
+    along = rng.uniform(size=shape)
+    return change, np.where(smooth[1], np.cumsum(along, axis=1), along)
+
+
+def undo_miss(change: Laterals, along: Floats, lever: Floats, miss: Laterals) -> Laterals:
+    """Return changes (N, k) of the guide plus a share of the directions `along` (N, k), so that they undo a miss.
+
+    miss: (N,), mm; lever: derivative (k,) of the miss. A direction without an effect on the miss is not used.
+    """
+    left, effect = change @ lever + miss, along @ lever
+    share = np.divide(left, effect, out=np.zeros_like(left), where=effect != 0.0)
+    undone: Laterals = change - share[:, None] * along
+    return undone
+
+
+def _widest(ahead: Ahead) -> float:
+    """Return the standard deviation (mm) of the largest corrections of the guide."""
+    return _STEEPEST * ahead.left + _SHARE_OF_A_STEP * ahead.step
 
 
 def _propose_angles(

@@ -21,6 +21,8 @@ scenario with its weight, as `[[plan.own_terms]]`, `[[control.ce_mpc.own_terms]]
 The terms with sums over steps are from the paper (eq. 13) and depend on the length of a step.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,51 +32,36 @@ from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, 
 PLAN, CE_MPC, ADAPTIVE_MPC = Cost("plan"), Cost("ce_mpc"), Cost("adaptive_mpc")
 
 Complexes = NDArray[np.complex128]
-_SHARP_MM = 0.1  # miss of a plan above which its square costs more than the miss itself
+_PLAN_PRECISION_MM = 0.1  # miss of a plan above which its square costs more than the miss itself
+ENERGIES = ("end energy", "mean energy", "peak energy")
+"""Terms whose weights are per E₁, the energy of all tissue down to the target displaced by 1 mm."""
 SHARE_OF_LIMIT = 0.8
 """Share of a limit of the guard above which a load is charged."""
 
 
-def past_target(trajectories: Trajectories, target: Point) -> Complexes:
-    """Return the lateral miss y + iz (N,), mm, of the line from the tip at the end, at the target's depth."""
-    end = trajectories.tips[:, -1]
+def per_energy(weights: Mapping[str, float], scale: float) -> dict[str, float]:
+    """Return weights by the names of terms with the weights of energies divided by a scale (mJ); 0 if it is 0."""
+    factors = dict.fromkeys(ENERGIES, 1.0 / scale if scale > 0.0 else 0.0)
+    return {name: weight * factors.get(name, 1.0) for name, weight in weights.items()}
+
+
+def past_target(tips: Floats, target: Point) -> Complexes:
+    """Return the lateral miss y + iz (N,), mm, of the line from the last of poses (N, m, 5), at the target's depth."""
+    end = tips[:, -1]
     slope = np.tan(end[:, THETA]) + 1j * np.tan(end[:, PSI])
     vector: Complexes = across(end, Y) + slope * (target[0] - end[:, X]) - complex(*target[1:])
     return vector
 
 
-@cost_term("mm", adaptive_mpc=Weight("miss"))
-def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats:
-    """Return the lateral distance (mm) from the target at its depth, the size of `past_target`.
-
-    blur (mm): uncertainty of the distance d, of which √(d² + blur²) − blur is charged.
-    """
-    blurred: Floats = np.hypot(np.abs(past_target(trajectories, target)), blur) - blur
-    return blurred
+@cost_term("mm", plan=Weight("miss"), adaptive_mpc=Weight("miss"))
+def miss(trajectories: Trajectories, target: Point, precision: float = _PLAN_PRECISION_MM) -> Floats:
+    """Return the lateral distance d from the target at its depth as |d| + d²/s (mm), s the `precision` (mm)."""
+    return charge_miss(np.abs(past_target(trajectories.tips, target)), precision)
 
 
-@cost_term("mm", plan=Weight("miss"))
-def planned_miss(trajectories: Trajectories, target: Point) -> Floats:
-    """Return the lateral distance d from the target at its depth as |d| + d²/s (mm), s = 0.1 mm."""
-    return charge_miss(np.abs(past_target(trajectories, target)))
-
-
-def charge_miss(distance: Floats) -> Floats:
-    """Return the cost (mm) of distances (mm) of planned ends from the target."""
-    return distance + distance**2 / _SHARP_MM
-
-
-@cost_term("mm", adaptive_mpc=Weight("large miss"))
-def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float) -> Floats:
-    """Return the share d² / (d² + sd²) of the `miss` (mm), d its distance and sd its standard deviation (mm).
-
-    The share is near 0 far below the standard deviation, and near 1 far above it.
-    """
-    square = np.abs(past_target(trajectories, target)) ** 2
-    least = np.finfo(float).tiny
-    share = square / np.maximum(square + sd**2, least)
-    large: Floats = share * miss(trajectories, target, blur)
-    return large
+def charge_miss(distance: Floats, precision: float = _PLAN_PRECISION_MM) -> Floats:
+    """Return the cost (mm) of distances (mm) of ends from the target."""
+    return distance + distance**2 / precision
 
 
 @cost_term(
@@ -85,13 +72,8 @@ def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float
         "Weight of the tissue energy at the target, relative to all tissue down to the target displaced by 1 mm.",
     ),
     adaptive_mpc=Weight(
-        "energy", "energy_weight_mm", "mm", 0.7,
-        "Weight of the tissue energy, relative to all tissue down to the target displaced by 1 mm.",
-        "larger to spare the tissue at the expense of accuracy.",
-        Weight(
-            "energy", "unguided_energy_weight_mm", "mm", 1.0,
-            "`energy_weight_mm` if the guide may not move.",
-        ),
+        "end energy", "end_energy_weight_mm", "mm", 0.3,
+        "Weight of the tissue energy at the target, relative to all tissue down to the target displaced by 1 mm.",
     ),
 )  # fmt: skip
 def energy_at_end(trajectories: Trajectories) -> Floats:
@@ -119,6 +101,10 @@ def deflection(trajectories: Trajectories) -> Floats:
         "mean energy", "mean_energy_weight_mm", "mm", 0.1,
         "`end_energy_weight_mm` for the energy averaged over the advance in the tissue.",
     ),
+    adaptive_mpc=Weight(
+        "mean energy", "mean_energy_weight_mm", "mm", 0.3,
+        "`end_energy_weight_mm` for the energy averaged over the path ahead.",
+    ),
 )  # fmt: skip
 def mean_energy(trajectories: Trajectories) -> Floats:
     """Return the strain energy of the tissue (mJ), averaged over the advance in the tissue."""
@@ -131,6 +117,11 @@ def mean_energy(trajectories: Trajectories) -> Floats:
     plan=Weight(
         "peak energy", "peak_energy_weight_mm", "mm", 0.1,
         "`end_energy_weight_mm` for the largest energy of all steps.",
+    ),
+    adaptive_mpc=Weight(
+        "peak energy", "peak_energy_weight_mm", "mm", 0.5,
+        "`end_energy_weight_mm` for the largest energy of the path ahead.",
+        "larger to spare the tissue at the expense of accuracy.",
     ),
 )  # fmt: skip
 def peak_energy(trajectories: Trajectories) -> Floats:
@@ -147,6 +138,10 @@ def peak_energy(trajectories: Trajectories) -> Floats:
         "Weight of the needle's strain, the tissue's compression and the guide's force beyond 80 % of their limits in "
         "`[guard]`, relative to these 80 %.",
     ),
+    adaptive_mpc=Weight(
+        "limits", "limit_weight_mm", "mm", 100.0,
+        "As `plan.limit_weight_mm`.",
+    ),
 )  # fmt: skip
 def load_excess(trajectories: Trajectories, strain: float, compression: float) -> Floats:
     """Return the excesses max(0, load / (0.8 limit) − 1) of the needle's strain and the tissue's compression, summed.
@@ -156,7 +151,7 @@ def load_excess(trajectories: Trajectories, strain: float, compression: float) -
     return _excess(trajectories.strain / strain) + _excess((1.0 - trajectories.stretch) / compression)
 
 
-@cost_term("1", outputs=("loads",), plan=Weight("guide force"))
+@cost_term("1", outputs=("loads",), plan=Weight("guide force"), adaptive_mpc=Weight("guide force"))
 def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
     """Return the excess of the guide's force over its limit (N), as `load_excess`."""
     return _excess(np.hypot(trajectories.loads[:, :, 4], trajectories.loads[:, :, 5]) / force)
@@ -165,21 +160,15 @@ def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
 @cost_term(
     "mm",
     adaptive_mpc=Weight(
-        "line", "line_weight", "–", 0.4,
-        "Weight of the tip's mean distance from the line to the target, times the remaining share of the path.",
-        unguided=Weight(
-            "line", "unguided_line_weight", "–", 0.0,
-            "`line_weight` if the guide may not move.",
-            "0, unless the path matters: without a guide, rolls consume reach.",
-        ),
+        "travel", "travel_weight", "–", 0.08,
+        "Weight of the guide's travel in the tissue: it moves only where that lowers the rest of the cost by more.",
+        "larger for less guide motion at the expense of accuracy.",
     ),
 )  # fmt: skip
-def distance_from_line(trajectories: Trajectories, start: Point, target: Point) -> Floats:
-    """Return the mean lateral distance (mm) of the tip from the line between two points, over the advance in tissue."""
-    x, y = trajectories.tips[:, :, X], across(trajectories.tips, Y)
-    length, begin = target[0] - start[0], complex(*start[1:])
-    slope = (complex(*target[1:]) - begin) / length if length != 0.0 else 0.0
-    return _mean_in_tissue(trajectories, np.abs(y - begin - slope * (x - start[0])))
+def guide_travel(trajectories: Trajectories) -> Floats:
+    """Return the length (mm) of the guide's path in the steps that end with the tip in the tissue."""
+    travel: Floats = (np.sqrt(_guide_squares(trajectories)) * (trajectories.tips[:, :, X] > 0.0)).sum(axis=1)
+    return travel
 
 
 @cost_term(
@@ -189,7 +178,7 @@ def distance_from_line(trajectories: Trajectories, start: Point, target: Point) 
         "Weight of the mean square slope of the guide's path, times the target's depth.",
     ),
     adaptive_mpc=Weight(
-        "slope", "slope_weight_mm", "mm", 0.5,
+        "slope", "slope_weight_mm", "mm", 0.1,
         "Weight of the mean square slope of the guide's path, times the remaining share of the path.",
         "larger for less guide motion and later corrections.",
     ),
@@ -240,14 +229,9 @@ def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Float
 @cost_term(
     "mm",
     adaptive_mpc=Weight(
-        "reach", "reach_weight", "–", 1.0,
-        "Weight of the expected distance of the target from the bevel's reach, with the guide fixed.",
-        "larger if the guide hardly moves the tip, as for deep targets.",
-        Weight(
-            "reach", "unguided_reach_weight", "–", 100.0,
-            "`reach_weight` on axes on which the guide may not move.",
-            "large: the bevel alone cannot regain lost reach.",
-        ),
+        "reach", "unguided_reach_weight", "–", 100.0,
+        "Weight of the expected distance of the target from the bevel's reach, on axes where the guide may not move.",
+        "large: the bevel alone cannot regain lost reach.",
     ),
 )  # fmt: skip
 def out_of_reach(trajectories: Trajectories, expected: Floats, angle: float = 0.0) -> Floats:

@@ -107,8 +107,7 @@ class Weight:
     """The weight of a term in the cost of one user.
 
     name: of the term in reports; key: of the weight in the user's settings, "" for a weight that is no setting; unit:
-    of the weight; default: its value; about, choose: description and advice for the reference of scenarios; unguided:
-    the weight that replaces it where the guide may not move (default: the same).
+    of the weight; default: its value; about, choose: description and advice for the reference of scenarios.
     """
 
     name: str
@@ -117,7 +116,6 @@ class Weight:
     default: float = 1.0
     about: str = ""
     choose: str = ""
-    unguided: "Weight | None" = None
 
 
 @dataclass(frozen=True)
@@ -171,9 +169,8 @@ class Cost:
         return ((term, term.weights[self.user]) for term in TERMS if self.user in term.weights)
 
     def settings(self) -> Iterator[Weight]:
-        """Yield the weights that are settings, in the order of the schema."""
-        for _, weight in self.rows():
-            yield from (each for each in (weight, weight.unguided) if each is not None and each.key)
+        """Return the weights that are settings, in the order of the schema."""
+        return (weight for _, weight in self.rows() if weight.key)
 
     def key(self, name: str) -> str:
         """Return the key of a term's weight."""
@@ -183,13 +180,9 @@ class Cost:
         """Return the weights, by key, with which no term but one counts: 0 for each of the others."""
         return {weight.key: 0.0 for weight in self.settings() if weight.name != name}
 
-    def weights(self, settings: Any, *, guided: bool = True) -> dict[str, float]:
+    def weights(self, settings: Any) -> dict[str, float]:
         """Return the weights by the names of the terms, from the user's settings."""
-        chosen = {w.name: w if guided or w.unguided is None else w.unguided for _, w in self.rows()}
-        return {
-            name: getattr(settings, weight.key) if weight.key else weight.default
-            for name, weight in chosen.items()
-        }
+        return {w.name: getattr(settings, w.key) if w.key else w.default for _, w in self.rows()}
 
     def terms(
         self, settings: Any, weights: Mapping[str, float] | None = None, **values: Any

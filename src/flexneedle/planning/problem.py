@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.costs.terms import PLAN
+from flexneedle.costs.terms import PLAN, per_energy
 from flexneedle.costs.weighted_sum import Term
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
@@ -55,15 +55,11 @@ class PlanProblem:
     def terms(self) -> tuple[Term, ...]:
         """Terms of the cost (mm). A roll before the first step is not charged; a force without a limit is no term."""
         depth, loads = self.target[0], self.loads
-        per_energy = 1.0 / self.energy_scale if self.energy_scale > 0.0 else 0.0
-        scales = dict.fromkeys(("end energy", "mean energy", "peak energy"), per_energy)
-        scales |= {"deflection": 1.0 / depth, "guide": depth}
-        weights = {
-            name: weight * scales.get(name, 1.0) for name, weight in PLAN.weights(self.settings).items()
-        }
+        weights = per_energy(PLAN.weights(self.settings), self.energy_scale)
+        weights["deflection"] /= depth
+        weights["guide"] *= depth
         weights["guide force"] = weights["limits"]
-        limits = {"strain": loads.strain, "compression": float(loads.compression.min()), "force": loads.force}
-        terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **limits)
+        terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **loads.values)
         return tuple(term for term in terms if term.name != "guide force" or np.isfinite(loads.force))
 
     @property

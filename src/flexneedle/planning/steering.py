@@ -222,7 +222,8 @@ def radius(rollout: RolloutFunction, problem: PlanProblem) -> float:
     Tissue has no preferred direction, so it is the same for each angle of the bevel.
     """
     ahead = (problem.target[0], problem.axis.real, problem.axis.imag)
-    end = past_target(rollout(controls_with_angles(problem, np.empty((1, 0)), np.zeros((1, 1)))), ahead)
+    found = rollout(controls_with_angles(problem, np.empty((1, 0)), np.zeros((1, 1))))
+    end = past_target(found.tips, ahead)
     return float(abs(end[0]))
 
 
@@ -230,7 +231,7 @@ def _ends(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]
     """Return the least and greatest position (mm), in the problem's direction, of ends of insertions without rolls."""
     ahead = (problem.target[0], 0.0, 0.0)
     ends = [
-        past_target(rollout(controls_with_flips(problem, np.empty((1, 0)), side)), ahead)[0]
+        past_target(rollout(controls_with_flips(problem, np.empty((1, 0)), side)).tips, ahead)[0]
         for side in (-1.0, 1.0)
     ]
     along = [float((end * problem.direction.conjugate()).real) for end in ends]

@@ -44,6 +44,11 @@ class LoadLimits:
         force = math.inf if settings.guide_force_n is None else settings.guide_force_n
         return LoadLimits(np.array(compression), 1e-2 * settings.needle_strain_percent, force)
 
+    @property
+    def values(self) -> dict[str, float]:
+        """The limits by name, the smallest compression of all laws."""
+        return {"strain": self.strain, "compression": float(self.compression.min()), "force": self.force}
+
     def excesses(self, state: State) -> Iterator[Excess]:
         """Yield the excess of tissue, needle and guide."""
         yield self._compression_excess(state)

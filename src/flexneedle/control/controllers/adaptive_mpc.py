@@ -1,28 +1,34 @@
 """`adaptive-mpc`, the default: each period, a plan to the target with a model that is fitted to the readings.
 
 Start, needle, guide and tissue are identified (`estimation.identification`). The current path, the guide over depth and
-the depths at which the bevel rolls, is first the plan's (`control.path`). Cross-entropy searches for a better one
-among its corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. The cost
-is a length: the miss plus weighted tissue energy, guide slope, rolls and distance from the line to the target,
-each relative to a scale of the scenario, so that one setting serves every needle.
+the depths at which the bevel rolls, is first the plan's (`control.path`). A better one is searched among its
+corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. With a guide there
+are two rounds: corrections on many scales, then corrections of the best that are aimed at the target, by the effect of
+the guide that the first round showed. With the bevel alone, cross-entropy refines the first samples.
+
+The cost is a length, so that one setting serves every needle and tissue: the miss and its square, the tissue energy at
+the target, in the mean and at its peak, the guide's travel and slope, rolls, and loads near the limits of the guard.
+The charge on travel is a dead band: the guide moves only where each millimetre lowers the other terms by more than its
+weight. Where only the bevel steers, the expected distance of the target from its reach is added.
 
 Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
-from pydantic import Field
+from pydantic import model_validator
 
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook, predict_ends
-from flexneedle.control.path import Ahead, GuidePath, path_of_plan, propose_samples
-from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
-from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
+from flexneedle.control.path import Ahead, GuidePath, aim_samples, path_of_plan, propose_samples
+from flexneedle.costs.terms import ADAPTIVE_MPC, past_target, per_energy
+from flexneedle.costs.weighted_sum import TIPS_ONLY, RolloutFunction, Term, Trajectories, Wanted, outputs_of
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.lateral import bevel_directions
@@ -31,9 +37,10 @@ from flexneedle.estimation.task import Task
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Found, Variables, find_best
 from flexneedle.results import format_mm
-from flexneedle.scenario.sections.fields import NonNegative, count
-from flexneedle.scenario.sections.weights import with_weights
-from flexneedle.types import STILL, Floats, Pose, Shape, X, Y, Z, laterals
+from flexneedle.scenario.sections.fields import NonNegative, Positive, count
+from flexneedle.scenario.sections.weights import drop_old_keys, with_weights
+from flexneedle.simulator.excess import LoadLimits
+from flexneedle.types import STILL, Floats, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
 _SMOOTHING = 0.3
@@ -43,6 +50,14 @@ _SURPRISE = 4.0  # residual of the fit, in standard deviations of a reading, fro
 _CERTAIN = 1e-9  # mm: standard deviation of a distance that is known
 _STILL = 1e-6  # rad: of a needle that did not roll
 
+_OLD_KEYS = (
+    "urgency",
+    "energy_weight_mm",
+    "unguided_energy_weight_mm",
+    "line_weight",
+    "unguided_line_weight",
+    "reach_weight",
+)
 _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
@@ -51,18 +66,24 @@ _LOST = 0.5  # probability of a miss beyond the limit from which a longer search
 class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 
-    samples: int = count(24, least=12, most=100_000)
-    """Paths per iteration of the search."""
+    samples: int = count(48, least=12, most=100_000)
+    """Paths per iteration of the search; twice as many if the guide may not move."""
     iterations: int = count(2, least=1, most=1_000)
-    """Iterations per control period."""
+    """Iterations per control period. With a guide, those after the first have samples aimed at the target."""
     effort: int = count(3, least=1, most=1_000)
     """Factor on `samples` in the first period, and in a repeated search if no path ends within
     `control.miss_limit_mm`."""
-    urgency: float = Field(default=1.5, ge=0.0, le=10.0)
-    """Exponent u of the factor r^(−u) on a miss above its standard deviation; r: remaining share of the path,
-    at least five steps."""
+    precision_mm: Positive = 0.03
+    """Miss d at which its square, d²/`precision_mm`, costs as much as d itself. If the guide may not move, times the
+    remaining share of the path, at least five steps."""
     unguided_reach_margin: NonNegative = 3.0
     """Factor on the standard deviation of the distance in `unguided_reach_weight`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_old_keys(cls, values: Any) -> Any:
+        why = "the controller charges the energy of the whole path now"
+        return drop_old_keys(values, "control.adaptive_mpc", _OLD_KEYS, why, ADAPTIVE_MPC)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,15 +97,16 @@ class Memory:
     rolled: GuidePath  # the same path after the roll of the command
     roll: float  # the needle's angle (rad) before the command
     scale: float  # energy (mJ) of the tissue down to the target displaced by 1 mm
+    loads: LoadLimits  # limits of the guard
     outlook: Outlook | None = None  # derivatives ahead of the tip, None before the first decision
     rests: int = 0  # number of rests already made
-    blur: float = 0.0  # standard deviation (mm) of a miss after all corrections that can still take effect
 
 
 def begin(task: Task) -> Memory:
     """Return the memory at the start, with the plan's path."""
-    path, scale = path_of_plan(task.plan), task.scenario.energy_scale(task.plan.target[0])
-    return Memory(path, path, task.plan.roll, scale)
+    path, scenario = path_of_plan(task.plan), task.scenario
+    scale = scenario.energy_scale(task.plan.target[0])
+    return Memory(path, path, task.plan.roll, scale, LoadLimits.of(scenario))
 
 
 def decide(
@@ -111,15 +133,7 @@ def decide(
     rest, rests = _rest_time(task, memory, fitted, ahead.left)
     why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
-    after = Memory(
-        path,
-        rolled,
-        fitted.state.roll,
-        memory.scale,
-        outlook,
-        rests,
-        outlook.sd_to_come(fitted, task.plan.target[0]),
-    )
+    after = replace(memory, path=path, rolled=rolled, roll=fitted.state.roll, outlook=outlook, rests=rests)
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples), after
 
 
@@ -159,16 +173,39 @@ def _is_surprised(fitted: Identified) -> bool:
 def search_path(
     task: Task, fitted: Identified, ahead: Ahead, memory: Memory, effort: int, rng: np.random.Generator
 ) -> Found:
-    """Return the best correction of the current path, which is itself among the samples."""
-    settings = task.settings
-    samples = effort * settings.samples
-    first = propose_samples(ahead, samples, rng, _aim_of_rolls(task, fitted, ahead))
-    lower, upper = ahead.bounds
-    variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
-    elite = elite_count(samples, _ELITE_FRACTION)
-    search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
+    """Return the best correction of the current path, which is itself among the samples.
+
+    With a guide, each later iteration aims its samples by the samples before them; with the bevel alone, cross-entropy
+    draws them.
+    """
+    settings, target = task.settings, task.plan.target
+    guided = ahead.step > 0.0
+    aimed = settings.iterations - 1 if guided else 0
+    count = effort * settings.samples * (1 if guided else 2)
+    z = propose_samples(ahead, count, rng, _aim_of_rolls(task, fitted, ahead))
     charged = cost_terms(task, fitted, memory, ahead)
     rollout = partial(rollout_as_measured, fitted, wanted=outputs_of(charged))
+    search = partial(_search_from, ahead, rollout, charged, settings.iterations - aimed, rng)
+    found = search(z)
+    for _ in range(aimed):
+        z = aim_samples(ahead, z, past_target(found.samples.tips, target), found.samples.costs, rng)
+        found = search(z)
+    return found
+
+
+def _search_from(
+    ahead: Ahead,
+    rollout: RolloutFunction,
+    charged: Sequence[Term],
+    iterations: int,
+    rng: np.random.Generator,
+    first: Floats,
+) -> Found:
+    """Return the best sample found by cross-entropy that begins with the samples `first` (N, d)."""
+    lower, upper = ahead.bounds
+    variables = Variables(lower, upper, first[0], first.std(axis=0), lambda z: ahead.controls(z)[0])
+    count = len(first)
+    search = Search(count, elite_count(count, _ELITE_FRACTION), iterations, _SMOOTHING, _TOLERANCE)
     return find_best(variables, rollout, charged, search, rng, first=first)
 
 
@@ -177,7 +214,7 @@ def _aim_of_rolls(task: Task, fitted: Identified, ahead: Ahead) -> complex:
     if ahead.setup.half_turns:
         return 1.0
     along = rollout_as_measured(fitted, ahead.controls(ahead.current[None])[0])
-    return complex(-past_target(along, task.plan.target)[0])
+    return complex(-past_target(along.tips, task.plan.target)[0])
 
 
 def rollout_as_measured(fitted: Identified, controls: Floats, wanted: Wanted = TIPS_ONLY) -> Trajectories:
@@ -194,32 +231,30 @@ def rollout_as_measured(fitted: Identified, controls: Floats, wanted: Wanted = T
 def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
     """Return the terms of the cost of a path, in mm."""
     settings, target = task.settings, task.plan.target
-    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
-    spare = guided and not _bevel_alone_across(task, ahead)
     uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
+    guided = guide_may_move(task.scenario.setup, task.plan.strategy) and not _bevel_alone_across(task, ahead)
+    weights = per_energy(ADAPTIVE_MPC.weights(settings), memory.scale)
     whole = max(target[0], uncorrected)
-    share = min(1.0, ahead.left / whole)  # of the path
-    urgent = min(1.0, max(ahead.left, uncorrected) / whole)
-    weights = ADAPTIVE_MPC.weights(settings, guided=guided)
-    weights["large miss"] = urgent**-settings.urgency - 1.0
-    weights["energy"] = weights["energy"] / memory.scale if memory.scale > 0.0 else 0.0
-    weights["line"] *= share
-    weights["slope"] *= share
+    # A late roll costs no more energy than an early one, a late motion of the guide does.
+    share = 1.0 if ahead.step > 0.0 else min(1.0, max(ahead.left, uncorrected) / whole)
+    weights["slope"] *= min(1.0, ahead.left / whole)
     weights["late"] *= fitted.roll_sd
-    weights["reach"] = ADAPTIVE_MPC.weights(settings, guided=spare)["reach"]
-    margin = 1.0 if spare else settings.unguided_reach_margin
-    expected, angle = expected_out_of_reach(task, fitted, ahead, memory, margin)
+    weights["guide force"] = weights["limits"] if math.isfinite(memory.loads.force) else 0.0
+    expected, angle = np.zeros(2), 0.0
+    if guided:
+        weights["reach"] = 0.0
+    else:
+        expected, angle = expected_out_of_reach(task, fitted, ahead, memory, settings.unguided_reach_margin)
     return ADAPTIVE_MPC.terms(
         settings,
         weights,
         target=target,
-        start=Pose.of(fitted.tip).point,
-        blur=memory.blur * share,
-        sd=memory.blur,
+        precision=settings.precision_mm * share,
         depth=target[0],
         length=uncorrected,
         expected=expected,
         angle=angle,
+        **memory.loads.values,
     )
 
 
@@ -233,14 +268,13 @@ def expected_out_of_reach(
     The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
     the second step on; the reach of a needle that rolls to any angle is the circle about the middle of such an
     interval. The bounds are normally distributed, `margin` times as widely as the estimate is, since reach that no
-    later step will need may be given away. With the bevel alone, lost reach cannot be regained; with a guide, the bevel
-    still moves the tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects,
-    so that only the distance across it counts.
+    later step will need may be given away, but lost reach cannot be regained by the bevel alone. Along the axis of a
+    guide that moves on one, the guide corrects, so that only the distance across it counts.
     """
     trajectories = rollout_as_measured(fitted, ahead.constant)
     if not trajectories.converged.all():
         return np.zeros(2), 0.0
-    past = past_target(trajectories, task.plan.target).reshape(2, 2)
+    past = past_target(trajectories.tips, task.plan.target).reshape(2, 2)
     middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
     if ahead.setup.half_turns:
         low, high = past.real.min(axis=1), past.real.max(axis=1)
@@ -278,7 +312,7 @@ def _forecast(
 
     The miss (mm) is y or, in space, y + iz; its standard deviation (mm) is on an axis; the shape is at the target.
     """
-    past = complex(past_target(found.trajectories, task.plan.target)[0])
+    past = complex(past_target(found.trajectories.tips, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
     both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.lean_guide(found.z)[None])[0]])
     predicted = predict_ends(fitted, both)

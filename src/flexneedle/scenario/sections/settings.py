@@ -19,7 +19,7 @@ from flexneedle.scenario.sections.fields import (
     count,
 )
 from flexneedle.scenario.sections.structure import Structure
-from flexneedle.scenario.sections.weights import name_functions, with_weights
+from flexneedle.scenario.sections.weights import drop_old_keys, name_functions, with_weights
 
 
 class Target(Section):
@@ -77,22 +77,14 @@ class PlanSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _drop_old_weights(cls, values: Any) -> Any:
-        """Return the values without the weights of the earlier cost, which was no length; a ScenarioWarning names them.
-
-        Another warning is about the weights of own terms. Both are for one version.
-        """
-        if not isinstance(values, Mapping):
-            return values
-        if old := [key for key in values if key in _OLD_WEIGHTS]:
-            keys, weights = ", ".join(f"plan.{key}" for key in old), ", ".join(w.key for w in PLAN.settings())
-            line = f"{keys}: not used, since the cost of a plan is in mm now; its weights: {weights}"
-            warnings.warn(line, ScenarioWarning, stacklevel=2)
-        if isinstance(values.get("own_terms"), list | tuple):
+        """Return the values without the weights of the earlier cost, and report the weights of own terms."""
+        values = drop_old_keys(values, "plan", _OLD_WEIGHTS, "the cost of a plan is in mm now", PLAN)
+        if isinstance(values, Mapping) and isinstance(values.get("own_terms"), list | tuple):
             line = (
                 "plan.own_terms: the cost of a plan is in mm now; divide weights of an older scenario by 20"
             )
             warnings.warn(line, ScenarioWarning, stacklevel=2)
-        return {key: value for key, value in values.items() if key not in _OLD_WEIGHTS}
+        return values
 
     @property
     def base_turn_sigma(self) -> float:

@@ -1,13 +1,14 @@
 """Weights of a cost as settings, and cost terms of the user."""
 
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Collection, Iterable, Mapping
 from inspect import Parameter, isroutine, signature
 from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, create_model
 
 from flexneedle.costs.weighted_sum import Cost, TermFunction, Weight
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, ScenarioWarning
 from flexneedle.plugins import function_rule, is_own, load_part
 from flexneedle.scenario.sections.fields import NonNegative, Section
 
@@ -21,6 +22,20 @@ def name_functions(given: Any) -> Any:
     if isinstance(given, list | tuple):
         return type(given)(map(name_functions, given))
     return f"{given.__module__}:{given.__qualname__}" if isroutine(given) else given
+
+
+def drop_old_keys(values: Any, section: str, old: Collection[str], why: str, cost: Cost) -> Any:
+    """Return the values of a section without keys of an earlier cost; a ScenarioWarning names them, for one version."""
+    if not isinstance(values, Mapping):
+        return values
+    if found := [key for key in values if key in old]:
+        keys, weights = (
+            ", ".join(f"{section}.{key}" for key in found),
+            ", ".join(w.key for w in cost.settings()),
+        )
+        line = f"{keys}: not used, since {why}; its weights: {weights}"
+        warnings.warn(line, ScenarioWarning, stacklevel=3)
+    return {key: value for key, value in values.items() if key not in old}
 
 
 def _resolve(name: str) -> TermFunction:
