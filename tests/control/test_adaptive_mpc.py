@@ -292,10 +292,10 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     for row in quick_plan.controls:
         state = plant.step(state, Control.of(row))
     blind = abs(state.tip[Y] - 5.0)
-    assert blind > 0.5
+    assert blind > 0.3
     misses = []
     for seed in range(5):
-        decisions, truth, estimate = carried_out(quick_plan, ACCURATE, plant, seed=seed)
+        decisions, truth, estimate = carried_out(quick_plan, PHANTOM, plant, seed=seed)
         misses.append(abs(truth.tip[Y] - 5.0))
         assert 0.0 <= travel_left(PHANTOM, quick_plan, estimate.state) <= PHANTOM.control.depth_tolerance_mm
         assert truth.tip[0] == pytest.approx(40.0, abs=0.05)
