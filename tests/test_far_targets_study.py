@@ -22,7 +22,7 @@ def test_a_target_that_one_search_misses_is_planned_with_each_width():
 
 @pytest.mark.long
 def test_the_edge_is_where_the_needle_ends():
-    assert far_targets.edge(world(1), 6.8, -1.0) == pytest.approx(7.65, abs=0.1)
+    assert far_targets.edge(world(1), 6.8, -1.0) == pytest.approx(8.25, abs=0.1)
 
 
 def test_the_edge_is_at_most_at_the_largest_lateral_offset(monkeypatch):
