@@ -17,7 +17,7 @@ def test_a_target_that_one_search_misses_is_planned_with_each_width():
     assert row["after_mm"] <= far_targets.HIT_MM
     assert far_targets.wide_hits(row)
     assert list(row["widths"]) == [str(width) for width in far_targets.WIDTHS]
-    assert row["after_s"] > row["before_s"] > 0.0
+    assert min(row["after_s"], row["before_s"]) > 0.0
 
 
 @pytest.mark.long
