@@ -2,8 +2,8 @@
 
     python studies/shorten.py STUDY --out FILE
 
-STUDY is the name of a shipped study. One repeat, the first case, and of each axis the first value, or the first two
-controllers, since its report compares them. An axis with "all" values stays.
+STUDY is the name of a shipped study. One repeat, the first case, and of each axis the first value; the first two
+controllers, since its report compares them, and two worlds. An axis with "all" values stays.
 """
 
 import argparse
@@ -30,7 +30,7 @@ def _first(table: dict[str, Any], key: str, count: int) -> dict[str, Any]:
         case list() as values:
             return {key: values[:count]}
         case dict() as numbers:
-            return {key: {**numbers, "count": count}}
+            return {key: {**numbers, "count": count + 1}}  # the first world alone may be out of reach
     return {}
 
 
