@@ -73,7 +73,7 @@ def charge_miss(distance: Floats, precision: float = _PLAN_PRECISION_MM) -> Floa
     ),
     adaptive_mpc=Weight(
         "end energy", "end_energy_weight_mm", "mm", 0.3,
-        "Weight of the tissue energy at the target, relative to all tissue down to the target displaced by 1 mm.",
+        "As `plan.end_energy_weight_mm`.",
     ),
 )  # fmt: skip
 def energy_at_end(trajectories: Trajectories) -> Floats:

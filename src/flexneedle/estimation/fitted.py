@@ -88,7 +88,7 @@ class FittedInsertion:
 
     @cached_property
     def moves_on(self) -> NDArray[np.bool_]:
-        """Whether each move (m,) advances, or ends in air: its readings are ahead of a needle at rest by the play."""
+        """Moves (m,) that advance or end in air: their readings are ahead of a needle at rest by the play."""
         moves_on: NDArray[np.bool_] = (self.rows[:, DB_X] > 0.0) | (self.tips[1:, X] <= 0.0)
         return moves_on
 
