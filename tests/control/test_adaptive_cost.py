@@ -3,10 +3,7 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, unrolled
 from flexneedle.control.controllers import adaptive_mpc
@@ -51,6 +48,7 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
         "flips": settings.roll_weight_mm,
         "late": settings.late_roll_weight * estimate.roll_sd,
         "reach": 0.0,
+        "reserve": 0.0,
     }
     assert found == expected
     assert 0.7 < ahead.left / 40.0 < 0.8
@@ -98,13 +96,15 @@ def test_the_deviation_of_the_miss_is_the_outlooks(quick_plan, along, strategy):
     assert decision.miss_sd == expected > 0.0
 
 
-@given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))
-def test_the_mean_above_zero_is_the_integral(mean, sd):
-    x = np.linspace(0.0, mean + 9.0 * sd, 20001)
-    density = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
-    expected = np.trapezoid(x * density, x) if x[-1] > 0.0 else 0.0
-    found = adaptive_mpc.mean_above_zero(np.array([mean]), np.array([sd]))[0]
-    assert found == pytest.approx(expected, abs=1e-4 * sd)
+@pytest.mark.parametrize(("margin", "charged"), [(0.0, False), (1.5, True)])
+def test_the_reserve_is_charged_from_the_second_decision_on_with_a_guide(quick_plan, along, margin, charged):
+    scenario = QUICK.with_values({"control.adaptive_mpc.reserve_margin": margin})
+    estimate = estimate_of(along(quick_plan, 40), scenario)
+    memory = decided(quick_plan, estimate)[1]
+    assert memory.lever is not None
+    assert (weights(scenario, quick_plan, 10.0, memory)[0]["reserve"] == 1.0) == charged
+    steering = replace(quick_plan, strategy="steering")
+    assert weights(scenario, steering, 10.0, decided(steering, estimate)[1])[0]["reserve"] == 0.0
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

@@ -99,7 +99,7 @@ def test_a_prior_is_proper_in_any_world(number):
     assert (prior.bounds[0] <= prior.mean).all()
     assert (prior.mean <= prior.bounds[1]).all()
     assert prior.steps.shape == prior.begins.shape == prior.mean.shape
-    assert (prior.steps > 0.0).all()
+    assert (prior.steps != 0.0).all()
     if not scenario.setup.has_guide:
         assert prior.mean[AT.clearance] == 0.0
         assert prior.bounds[1, AT.clearance] < 1e-3

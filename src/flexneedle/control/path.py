@@ -25,6 +25,8 @@ KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""
 LEAST_SLOTS = 4
 """Least number of rolls in a search, which has as many as the current path."""
+LEAN = 0.1
+"""Correction of the guide (mm) that shows its effect."""
 _FINE = 2  # first steps of the rollout, each of one control step
 _COARSE = 2.0  # length of its later steps, in control steps
 _DUE = 0.05  # of a control step: a roll this near is made at once
@@ -32,7 +34,6 @@ _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of t
 _SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step, added to it: largest next to the target
 _FURTHEST = 0.3  # largest move of a roll, of the path left
 _WIDEST = 1.0  # largest change of an angle (rad)
-_LEAN = 0.1  # mm
 _DECADES = 2.0  # over which the scales of the samples spread
 _FINER_DECADES = (-2.5, -0.3)  # of the scales of samples around the best
 _OVERSHOOT = 1.2  # largest share of a miss that an aimed sample undoes
@@ -149,10 +150,10 @@ class Ahead:
         return np.concatenate([np.zeros(self.knots), rolls[:, 0], angles])
 
     def lean_guide(self, z: Floats) -> Floats:
-        """Return a sample (d,) with the guide 0.1 mm further in +y at the target, where it may move."""
-        other = z.copy()
-        other[: KNOTS.size] += _LEAN * KNOTS if self.step > 0.0 else 0.0
-        return other
+        """Return samples (k, d): in each the guide is `LEAN` further in +y at one of the knots, if it may move."""
+        others = np.tile(z, (KNOTS.size, 1))
+        others[:, : KNOTS.size] += np.diag(np.full(KNOTS.size, LEAN if self.step > 0.0 else 0.0))
+        return others
 
     @property
     def constant(self) -> Floats:

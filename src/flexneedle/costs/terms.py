@@ -26,6 +26,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.costs.normal import mean_above_zero, mean_square_above_zero
 from flexneedle.costs.weighted_sum import Cost, Trajectories, Weight, cost_term
 from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, X, Y, across
 
@@ -242,6 +243,40 @@ def out_of_reach(trajectories: Trajectories, expected: Floats, angle: float = 0.
     away = 0.5 - 0.5 * np.cos(trajectories.controls[:, 0, ROLL] - angle)
     value: Floats = (1.0 - away) * expected[0] + away * expected[1]
     return value
+
+
+@cost_term("mm", adaptive_mpc=Weight("reserve"))
+def lost_reserve(
+    trajectories: Trajectories,
+    begins: Floats,
+    sds: Floats,
+    reach: float,
+    precision: float,
+    *,
+    any_angle: bool,
+) -> Floats:
+    """Return the expected miss, as in `miss`, that the bevel alone cannot correct, at the worst of some depths.
+
+    begins (b,): depths (mm), below which the end will prove to be off by normal distances with the standard deviations
+    `sds` (b,), mm; reach: lateral motion of the end, mm per mm of path on which the bevel keeps its side. On the path
+    from a depth on, of length L, the bevel moves the end by u, |u| ≤ L reach; L reach − |u| is left.
+    """
+    advance = trajectories.controls[:, :, DB_X]
+    turns = trajectories.controls[:, :, ROLL] + trajectories.controls[:, :, SPIN]
+    bevel = np.exp(1j * np.cumsum(turns, axis=1))
+    costs = [np.zeros(len(advance))]
+    for begin, sd in zip(begins, sds, strict=True):
+        after = reach * np.clip(trajectories.tips[:, :, X] - begin, 0.0, advance)
+        used, most = (after * bevel).sum(axis=1), after.sum(axis=1)
+        sides = [np.abs(used)] if any_angle else [used.real, -used.real]
+        costs.append(np.sum([expected_miss(side - most, sd, precision) for side in sides], axis=0))
+    worst: Floats = np.max(costs, axis=0)
+    return worst
+
+
+def expected_miss(mean: Floats, sd: float, precision: float) -> Floats:
+    """Return the mean cost (mm), as in `miss`, of normal distances (mm), those below zero free."""
+    return mean_above_zero(mean, sd) + mean_square_above_zero(mean, sd) / precision
 
 
 @cost_term("mm²", ce_mpc=Weight("deviation"))

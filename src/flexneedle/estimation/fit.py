@@ -1,7 +1,7 @@
 """The step of a fit, Gauss–Newton to the maximum a posteriori, and the derivatives that it needs.
 
 The derivatives of the sensors' quantities with respect to the parameters are kept as curves over the depth of the tip,
-a few steps ahead of it too. A few of the curves are simulated again each period, so that none is older than `ROUND`
+a few steps ahead of it too. Some of the curves are simulated again each period, so that none is older than `ROUND`
 periods.
 """
 
@@ -40,9 +40,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     gradient = (weighted @ np.concatenate(fitted.residuals)).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
     fitted = fitted.change(precision=precision)
-    step = np.linalg.solve(precision, gradient)
-    whole = step if np.isfinite(step).all() else np.zeros_like(step)
-    goal = np.clip(fitted.parameters + whole, *prior.bounds)
+    goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
 
     def cost(other: FittedInsertion) -> float:
         squares = np.abs(np.concatenate(other.residuals)) ** 2
@@ -64,6 +62,30 @@ def improve_fit(fitted: Fitted) -> Fitted:
     return differentiate(trial)
 
 
+def step_within(precision: Floats, gradient: Floats, bounds: Floats) -> Floats:
+    """Return a step s (K,) to the maximum of gradient·s − s·precision·s / 2 within bounds (2, K) about 0; 0 if none.
+
+    It goes to the maximum up to the first bound, and on from there without the parameter that stays at it, as an active
+    set method does: a step that is only cut at the bounds leads correlated parameters where the fit may be worse.
+    """
+    step, free = np.zeros_like(gradient), np.ones(gradient.size, dtype=bool)
+    while free.any():
+        inner = np.ix_(free, free)
+        way = np.linalg.solve(precision[inner], (gradient - precision @ step)[free])
+        if not np.isfinite(way).all():
+            return np.zeros_like(gradient)
+        ends = np.where(way > 0.0, bounds[1, free], bounds[0, free]) - step[free]
+        shares = np.divide(ends, way, out=np.full_like(way, np.inf), where=way != 0.0)
+        first = int(np.argmin(shares))
+        if shares[first] >= 1.0:
+            step[free] += way
+            break
+        step[free] += shares[first] * way
+        place = np.flatnonzero(free)[first]
+        step[place], free[place] = bounds[int(way[first] > 0.0), place], False
+    return step
+
+
 def jacobian_of(fitted: FittedInsertion) -> Laterals:
     """Return the derivative (r, K) of the predicted readings of all sensors, from the curves."""
     parts = []
@@ -77,8 +99,6 @@ def jacobian_of(fitted: FittedInsertion) -> Laterals:
 
 ROUND = 8
 """Periods in which each curve is simulated once."""
-LEADING_ROUND = 2
-"""Periods in which the curves of base, bend, bevel and clearance are."""
 
 
 def simulate_due(
@@ -125,11 +145,12 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
 
 
 def due_parameters(fitted: FittedInsertion) -> Iterator[int]:
-    """Yield the parameters whose curves are simulated this period."""
-    leading = (*range(fitted.slots.run_out.start), fitted.slots.bevel, fitted.slots.clearance)
-    for place, k in enumerate(leading):
-        if place % LEADING_ROUND == fitted.period % LEADING_ROUND:
-            yield k
+    """Yield the parameters whose curves are simulated this period.
+
+    Base, bend, bevel and clearance always are, together: their effects are so alike until the needle rolls that curves
+    of different periods would differ by more, and tell them apart where no reading does.
+    """
+    yield from (*range(fitted.slots.run_out.start), fitted.slots.bevel, fitted.slots.clearance)
     for k in range(fitted.slots.modulus, fitted.parameters.size):
         if k % ROUND == fitted.period % ROUND:
             yield k

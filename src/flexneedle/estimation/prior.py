@@ -53,7 +53,10 @@ LEAST_SD = 1e-6
 _LATERAL_STEPS = (0.05, 3e-4, 0.05, 0.05, 1e-3)  # for differences, on each axis: mm, rad, mm, mm, rad
 _STEPS = (0.05, 0.02)  # of bevel factor and clearance: 1, mm
 _LOG_STEP = 0.05
-_SHIFT_STEP = 0.2  # mm
+_SHIFT_STEP = (
+    2.0 / 3.0
+)  # of the standard deviation, towards the skin: below the target a boundary has no effect
+_LEAST_SHIFT = 0.2  # mm
 _WIDEST = 4.0  # standard deviations by which a parameter may deviate from its prior
 _MOST_CELLS = 200
 
@@ -132,7 +135,8 @@ class Prior:
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
         bounds[0, slots.clearance] = 0.0
         bounds[:, slots.bevel] = 0.0, _largest_bevel(scenario)
-        logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
+        shift = -max(_SHIFT_STEP * settings.boundary_sd_mm, _LEAST_SHIFT)
+        logs, shifts = [_LOG_STEP] * layers, [shift] * (layers - 1)
         steps = np.array(
             [*np.repeat(_LATERAL_STEPS[: len(lateral)], axes), *_STEPS, *logs, *shifts, *[_LOG_STEP] * cells]
         )

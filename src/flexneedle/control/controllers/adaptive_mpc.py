@@ -9,16 +9,17 @@ the guide that the first round showed. With the bevel alone, cross-entropy refin
 The cost is a length, so that one setting serves every needle and tissue: the miss and its square, the tissue energy at
 the target, in the mean and at its peak, the guide's travel and slope, rolls, and loads near the limits of the guard.
 The charge on travel is a dead band: the guide moves only where each millimetre lowers the other terms by more than its
-weight. Where only the bevel steers, the expected distance of the target from its reach is added.
+weight. Where only the bevel steers, the expected distance of the target from its reach is added; where the guide does,
+too, the expected miss that the bevel cannot correct after the guide has lost its effect (`control.reserve`).
 
 Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from pydantic import model_validator
@@ -26,7 +27,9 @@ from pydantic import model_validator
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook, predict_ends
-from flexneedle.control.path import Ahead, GuidePath, aim_samples, path_of_plan, propose_samples
+from flexneedle.control.path import KNOTS, Ahead, GuidePath, aim_samples, path_of_plan, propose_samples
+from flexneedle.control.reserve import NO_RESERVE, Lever, reserve_of_bevel
+from flexneedle.costs.normal import mean_above_zero
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target, per_energy
 from flexneedle.costs.weighted_sum import TIPS_ONLY, RolloutFunction, Term, Trajectories, Wanted, outputs_of
 from flexneedle.estimation.estimate import Estimate
@@ -47,7 +50,6 @@ _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _SURPRISE = 4.0  # residual of the fit, in standard deviations of a reading, from which the needle rests
-_CERTAIN = 1e-9  # mm: standard deviation of a distance that is known
 _STILL = 1e-6  # rad: of a needle that did not roll
 
 _OLD_KEYS = (
@@ -76,6 +78,9 @@ class AdaptiveMpc(Priors):
     precision_mm: Positive = 0.03
     """Miss d at which its square, d²/`precision_mm`, costs as much as d itself. If the guide may not move, times the
     remaining share of the path, at least five steps."""
+    reserve_margin: NonNegative = 1.5
+    """Factor on the standard deviation of what readings will show where the guide has no effect any more; the bevel is
+    kept able to correct it. 0: it need not."""
     unguided_reach_margin: NonNegative = 3.0
     """Factor on the standard deviation of the distance in `unguided_reach_weight`."""
 
@@ -98,7 +103,9 @@ class Memory:
     roll: float  # the needle's angle (rad) before the command
     scale: float  # energy (mJ) of the tissue down to the target displaced by 1 mm
     loads: LoadLimits  # limits of the guard
-    outlook: Outlook | None = None  # derivatives ahead of the tip, None before the first decision
+    # derivatives ahead of the tip, and the guide's lever, None before the first decision
+    outlook: Outlook | None = None
+    lever: Lever | None = None
     rests: int = 0  # number of rests already made
 
 
@@ -123,17 +130,18 @@ def decide(
     found = search_path(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
     if not math.isfinite(found.cost):
         return Decision(STILL, "no path converges on the fitted model", found.cost), memory
-    outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
-    if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
+    forecast = _forecast(task, memory, fitted, ahead, found)
+    if probability_beyond(task.scenario.control.miss_limit_mm, forecast.miss, forecast.sd) > _LOST:
         ahead = Ahead.of(task, fitted.state, ahead.correct(found.z))
         found = search_path(task, fitted, ahead, memory, settings.effort, rng)
-        outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
+        forecast = _forecast(task, memory, fitted, ahead, found)
+    outlook, lever, miss, sd, predicted = forecast
     path = ahead.correct(found.z)
     command, rolled = ahead.first_command(path)
     rest, rests = _rest_time(task, memory, fitted, ahead.left)
     why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
-    after = replace(memory, path=path, rolled=rolled, roll=fitted.state.roll, outlook=outlook, rests=rests)
+    after = Memory(path, rolled, fitted.state.roll, memory.scale, memory.loads, outlook, lever, rests)
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples), after
 
 
@@ -240,11 +248,23 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
     weights["slope"] *= min(1.0, ahead.left / whole)
     weights["late"] *= fitted.roll_sd
     weights["guide force"] = weights["limits"] if math.isfinite(memory.loads.force) else 0.0
-    expected, angle = np.zeros(2), 0.0
-    if guided:
-        weights["reach"] = 0.0
-    else:
+    expected, angle, reserve = np.zeros(2), 0.0, NO_RESERVE
+    if not guided:
         expected, angle = expected_out_of_reach(task, fitted, ahead, memory, settings.unguided_reach_margin)
+    elif memory.outlook and memory.lever:
+        constant = rollout_as_measured(fitted, ahead.constant)
+        reserve = reserve_of_bevel(
+            fitted,
+            ahead,
+            memory.outlook,
+            memory.lever,
+            constant,
+            target,
+            least=settings.travel_weight,
+            margin=settings.reserve_margin,
+        )
+    weights["reach"] *= not guided
+    weights["reserve"] *= bool(reserve.sds.any())
     return ADAPTIVE_MPC.terms(
         settings,
         weights,
@@ -254,6 +274,7 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
         length=uncorrected,
         expected=expected,
         angle=angle,
+        **reserve._asdict(),
         **memory.loads.values,
     )
 
@@ -297,36 +318,36 @@ def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
     return guided and setup.moved_guide_axes < setup.axes and not setup.half_turns
 
 
-def mean_above_zero(mean: Floats, sd: Floats) -> Floats:
-    """Return the mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
-    z = mean / np.maximum(sd, _CERTAIN)
-    below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])
-    part: Floats = mean * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    return part
+class Forecast(NamedTuple):
+    """Derivatives ahead of the tip, the guide's lever, and what is predicted."""
+
+    outlook: Outlook
+    lever: Lever
+    miss: complex  # y or, in space, y + iz (mm)
+    sd: float  # its standard deviation on an axis (mm)
+    shape: Shape  # at the target
 
 
-def _forecast(
-    task: Task, memory: Memory, fitted: Identified, ahead: Ahead, found: Found
-) -> tuple[Outlook, complex, float, Shape]:
-    """Return the derivatives ahead of the tip, the predicted miss, its standard deviation, and the predicted shape.
-
-    The miss (mm) is y or, in space, y + iz; its standard deviation (mm) is on an axis; the shape is at the target.
-    """
+def _forecast(task: Task, memory: Memory, fitted: Identified, ahead: Ahead, found: Found) -> Forecast:
+    """Return the forecast along the best path."""
     past = complex(past_target(found.trajectories.tips, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
-    both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.lean_guide(found.z)[None])[0]])
-    predicted = predict_ends(fitted, both)
-    nodes, leaning = predicted.shapes[:2, -1]
+    leaning = ahead.controls(ahead.lean_guide(found.z))[0]
+    predicted = predict_ends(fitted, np.concatenate([found.trajectories.controls, leaning]))
+    lever = Lever.of(ahead, predicted, task.plan.target)
+    nodes, *leant = predicted.shapes[: 1 + KNOTS.size, -1]
     outlook = (memory.outlook or Outlook.of(fitted)).renew(fitted, predicted)
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     sd = outlook.sd(fitted, task.plan.target[0], miss, guided=guided)
-    by_guide, by_bevel = laterals(leaning - nodes, Y, fitted.axes), outlook.bent[fitted.slots.bevel]
+    by_guide = KNOTS @ laterals(np.array(leant) - nodes, Y, fitted.axes)
+    by_bevel = outlook.bent[fitted.slots.bevel]
     guide, bevel = (
         moved / moved[-1] if abs(moved[-1]) > _STILL else 0.0 * moved for moved in (by_guide, by_bevel)
     )
     share = min(1.0, _FURTHEST_LEVER / max(float(np.abs(guide).max()), 1.0)) if guide.any() else 0.0
-    lever = share * guide + (1.0 - share) * bevel
-    return outlook, miss, sd, Shape(nodes, outlook.shape_sd(fitted, task.plan.target[0], lever, sd))
+    undoing = share * guide + (1.0 - share) * bevel
+    shape = Shape(nodes, outlook.shape_sd(fitted, task.plan.target[0], undoing, sd))
+    return Forecast(outlook, lever, miss, sd, shape)
 
 
 CONTROLLER = Controller(
