@@ -120,7 +120,7 @@ def mean_energy(trajectories: Trajectories) -> Floats:
         "`end_energy_weight_mm` for the largest energy of all steps.",
     ),
     adaptive_mpc=Weight(
-        "peak energy", "peak_energy_weight_mm", "mm", 0.5,
+        "peak energy", "peak_energy_weight_mm", "mm", 0.8,
         "`end_energy_weight_mm` for the largest energy of the path ahead.",
         "larger to spare the tissue at the expense of accuracy.",
     ),
