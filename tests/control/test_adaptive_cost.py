@@ -7,6 +7,7 @@ import pytest
 
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, unrolled
 from flexneedle.control.controllers import adaptive_mpc
+from flexneedle.control.outlook import Outlook
 from flexneedle.control.path import path_of_plan
 from flexneedle.costs import terms
 from flexneedle.planning.planner import bevel_reach
@@ -25,7 +26,9 @@ def weights(scenario, plan, x, memory=None):
     estimate, task = estimate_of(state, scenario), task_of(simulator, plan)
     memory = memory or ADAPTIVE.begin(task)
     ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
-    listed = adaptive_mpc.cost_terms(task, estimate, memory, ahead)
+    listed = adaptive_mpc.cost_terms(
+        task, estimate, memory, ahead, adaptive_mpc.find_ends(task, estimate, ahead)
+    )
     return {term.name: term.weight for term in listed}, task, estimate, ahead
 
 
@@ -79,7 +82,13 @@ def test_a_miss_is_charged_with_the_precision_of_the_settings(quick_plan, along,
     memory = ADAPTIVE.begin(task)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
     trajectories = adaptive_mpc.rollout_as_measured(estimate, ahead.controls(ahead.current[None])[0])
-    (term,) = (term for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead) if term.name == "miss")
+    (term,) = (
+        term
+        for term in adaptive_mpc.cost_terms(
+            task, estimate, memory, ahead, adaptive_mpc.find_ends(task, estimate, ahead)
+        )
+        if term.name == "miss"
+    )
     off = abs(float(terms.past_target(trajectories.tips, plan.target)[0].real))
     assert off > 0.5
     precision = 0.7 * (share or ahead.left / 40.0)
@@ -118,7 +127,9 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least), 0.0), roll=roll)
     task = task_of(simulator, plan)
     ahead = adaptive_mpc.Ahead.of(task, state, unrolled(path_of_plan(plan)))
-    expected, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task), 1.0)
+    expected, angle = adaptive_mpc.expected_out_of_reach(
+        task, estimate, ahead, Outlook.of(estimate), adaptive_mpc.find_ends(task, estimate, ahead), 1.0
+    )
     rollout = adaptive_mpc.rollout_as_measured(estimate, ahead.constant)
     kept, _, rolled, _ = terms.out_of_reach(rollout, expected, angle)
     assert min(kept, rolled) >= 0.0
@@ -132,9 +143,16 @@ def test_the_bevel_keeps_its_reach_with_a_margin_where_it_steers_alone(quick_pla
     estimate, task = estimate_of(state, BARE), task_of(simulator, quick_plan)
     memory = ADAPTIVE.begin(task)
     ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
-    charged = {term.name: term.value for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead)}
+    charged = {
+        term.name: term.value
+        for term in adaptive_mpc.cost_terms(
+            task, estimate, memory, ahead, adaptive_mpc.find_ends(task, estimate, ahead)
+        )
+    }
     sure, wide, wider = (
-        adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, margin)[0]
+        adaptive_mpc.expected_out_of_reach(
+            task, estimate, ahead, Outlook.of(estimate), adaptive_mpc.find_ends(task, estimate, ahead), margin
+        )[0]
         for margin in (0.0, 1.0, task.settings.unguided_reach_margin)
     )
     assert (sure <= wide).all()

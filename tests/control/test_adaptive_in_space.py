@@ -61,7 +61,7 @@ def prepared(state, target, scenario=SPACE):
 @pytest.mark.parametrize("offset", [0.7 + 0.2j, -0.3 + 0.9j, -1.0j])
 def test_it_aims_from_where_the_current_path_ends_to_the_target(state, offset):
     task, estimate, _, ahead = prepared(state, ends(state) + offset)
-    assert adaptive_mpc._aim_of_rolls(task, estimate, ahead) == pytest.approx(offset, abs=0.02)
+    assert -adaptive_mpc.find_ends(task, estimate, ahead)[0] == pytest.approx(offset, abs=0.02)
 
 
 @pytest.mark.parametrize("direction", [0.0, 1.0, 2.5, -2.0])
@@ -78,8 +78,10 @@ def test_the_reach_after_a_step_is_a_disc(state, direction, beyond):
     middle = np.mean([np.mean(around) for around in rolled.values()])
     radius = np.mean([np.abs(np.array(around) - np.mean(around)).mean() for around in rolled.values()])
     target = middle + (radius + beyond) * cmath.exp(1j * direction)
-    task, estimate, memory, ahead = prepared(state, target)
-    distances, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, 1.0)
+    task, estimate, _, ahead = prepared(state, target)
+    distances, angle = adaptive_mpc.expected_out_of_reach(
+        task, estimate, ahead, Outlook.of(estimate), adaptive_mpc.find_ends(task, estimate, ahead), 1.0
+    )
     aimed = state.bevel * cmath.exp(1j * angle)
     assert aimed == pytest.approx((target - middle) / abs(target - middle), abs=1e-2)
     for expected, first in zip(distances, (angle, angle + math.pi), strict=True):
@@ -98,13 +100,22 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
     middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
     far = middle + side * 3.0j
     task, estimate, memory, ahead = prepared(state, far)
-    both, _ = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, 1.0)
+    both, _ = adaptive_mpc.expected_out_of_reach(
+        task, estimate, ahead, Outlook.of(estimate), adaptive_mpc.find_ends(task, estimate, ahead), 1.0
+    )
     task, estimate, memory, ahead = prepared(there, far + 5.0, one_axis)
-    across, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, 1.0)
+    across, angle = adaptive_mpc.expected_out_of_reach(
+        task, estimate, ahead, Outlook.of(estimate), adaptive_mpc.find_ends(task, estimate, ahead), 1.0
+    )
     assert across == pytest.approx(both, abs=0.02)
     assert across[0] > 1.0
     assert there.bevel * cmath.exp(1j * angle) == pytest.approx(side * 1j, abs=1e-9)
-    weight = {term.name: term.weight for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead)}
+    weight = {
+        term.name: term.weight
+        for term in adaptive_mpc.cost_terms(
+            task, estimate, memory, ahead, adaptive_mpc.find_ends(task, estimate, ahead)
+        )
+    }
     assert weight["reach"] == task.settings.unguided_reach_weight
 
 

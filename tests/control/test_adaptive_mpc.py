@@ -126,14 +126,18 @@ def test_the_current_path_is_never_replaced_by_a_worse_one(quick_plan, along):
     """The cost found is at most the current path's, for any rolls and guide."""
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task = task_of(estimate.nominal, quick_plan)
+    _, begun = decided(quick_plan, estimate)
     for rolls in ((), (20.0,), (15.0, 18.0)):
         path = replace(path_of_plan(quick_plan), rolls=rolls_at(*rolls))
+        memory = replace(begun, path=path, roll=estimate.state.roll)
         ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
         kept = ahead.controls(ahead.current[None])[0]
-        listed = adaptive_mpc.cost_terms(task, estimate, ADAPTIVE.begin(task), ahead)
+        ends = adaptive_mpc.find_ends(task, estimate, ahead)
+        listed = adaptive_mpc.cost_terms(task, estimate, memory, ahead, ends)
         found = adaptive_mpc.rollout_as_measured(estimate, kept, outputs_of(listed))
         current = float(evaluate_cost(listed, found)[0])
-        assert decided(quick_plan, estimate, path=path)[0].cost <= current + 1e-9
+        decision, _ = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
+        assert decision.cost <= current + 1e-9
 
 
 @pytest.mark.parametrize("carried_out", [False, True])
@@ -217,10 +221,10 @@ def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monke
     _, memory = decided(quick_plan, estimate)
     task = task_of(estimate.nominal, quick_plan)
     ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
-    assert efforts == [task.settings.effort, 1]
+    assert efforts == [1, task.settings.effort, 1]
     far = replace(quick_plan, target=(40.0, 14.0, 0.0))
     decision, _ = ADAPTIVE.decide(task_of(estimate.nominal, far), memory, estimate, np.random.default_rng(0))
-    assert efforts[2:] == [1, task.settings.effort]
+    assert efforts[3:] == [1, task.settings.effort]
     assert decision.miss < -2.0
 
 

@@ -39,11 +39,12 @@ def test_the_reserve_begins_where_the_lever_is_lost_and_knows_more_the_deeper(qu
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     memory = decided(quick_plan, estimate)[1]
     ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, memory.path)
-    constant = adaptive_mpc.rollout_as_measured(estimate, ahead.constant)
+    ends = adaptive_mpc.find_ends(task_of(estimate.nominal, quick_plan), estimate, ahead)
+    bend = adaptive_mpc.bend_of(ahead, ends)
 
     def found(least, margin):
         return reserve_of_bevel(
-            estimate, ahead, memory.outlook, memory.lever, constant, quick_plan.target,
+            estimate, ahead, memory.outlook, memory.lever, bend, quick_plan.target,
             least=least, margin=margin,
         )  # fmt: skip
 
@@ -54,6 +55,6 @@ def test_the_reserve_begins_where_the_lever_is_lost_and_knows_more_the_deeper(qu
     assert (np.diff(whole.sds) <= 0.0).all()
     assert whole.sds[0] > whole.sds[-1] > 0.0
     np.testing.assert_allclose(whole.sds, 2.0 * half.sds)
-    kept, _, rolled, _ = adaptive_mpc.past_target(constant.tips, quick_plan.target)
+    _, kept, _, rolled, _ = ends
     assert 2.0 * whole.reach * ahead.left == pytest.approx(abs(kept - rolled))
     assert found(0.0, 1.0).begins[0] == pytest.approx(ahead.depth[-1])

@@ -57,9 +57,9 @@ def test_derivatives_agree_with_central_differences():
         central = np.subtract(*ends) / (2.0 * step[k])
         scale = np.abs(central).max()
         np.testing.assert_allclose(close[:, k], central, atol=6e-3 * scale + 1e-7)
-        # Half a step of a boundary may lie across the middle of a contact's interval, where the slope jumps;
+        # A step of a boundary is long, and may lie across the middles of contacts' intervals, where the slope jumps;
         # of the clearance, across where the needle leaves a wall.
-        off = 0.25 if AT.shift <= k < AT.cells or k == AT.clearance else 0.03
+        off = 0.35 if AT.shift <= k < AT.cells or k == AT.clearance else 0.03
         assert np.linalg.norm(jacobian[:, k] - central) <= off * np.linalg.norm(central) + 1e-6
     deepest = estimate.tips[:, X].max()
     np.testing.assert_array_equal(jacobian[:, AT.cells + int(deepest // 2.5) + 1 :], 0.0)

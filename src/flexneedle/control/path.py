@@ -37,7 +37,7 @@ _WIDEST = 1.0  # largest change of an angle (rad)
 _DECADES = 2.0  # over which the scales of the samples spread
 _FINER_DECADES = (-2.5, -0.3)  # of the scales of samples around the best
 _OVERSHOOT = 1.2  # largest share of a miss that an aimed sample undoes
-_RANK = 1e-3  # of the largest singular value of the tried corrections: smaller ones do not count
+_UNAIMED = 3  # the first of a dozen samples whose guide is not aimed: it and the next have other rolls
 _TURNS = 4.0 * np.pi  # from the present angle, to either side: bounds of an angle
 
 
@@ -170,6 +170,12 @@ class Ahead:
         rows, depth = self._without_rolls(z[:, : self.knots], depth)
         rows[:, :, ROLL] = roll
         return rows, depth
+
+    def bevel_use(self, z: Floats) -> Laterals:
+        """Return the integral (N,) of the bevel's direction, relative to the present one, over the path (mm)."""
+        depth, roll = self._grid(z[:, self.depths], z[:, self.angles])
+        used: Laterals = (np.diff(depth, axis=1) * np.exp(1j * np.cumsum(roll, axis=1))).sum(axis=1)
+        return used
 
     def _without_rolls(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
         """Return controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
@@ -308,44 +314,26 @@ def propose_samples(ahead: Ahead, count: int, rng: np.random.Generator, aim: com
 
 
 def aim_samples(
-    ahead: Ahead, tried: Floats, misses: Laterals, costs: Floats, rng: np.random.Generator
+    ahead: Ahead, z: Floats, miss: complex, lever: Floats, bend: complex, rng: np.random.Generator
 ) -> Floats:
-    """Return as many samples as were tried (N, d), around the best, which is the first, and aimed at the target.
+    """Return samples z (N, d), the current path first, with corrections of the guide that are aimed at the target.
 
-    misses: y + iz (N,), mm, of the samples tried; costs: (N,). The derivative of the miss to the corrections of the
-    guide is fitted to the samples that correct the guide alone. Each new sample is a random change of the guide, and a
-    second one in a random direction, as large as undoes 0 to 1.2 of the miss by that derivative; a third of the samples
-    have only the second. An eighth have the rolls of another sample.
+    miss: y + iz, mm, of the current path; lever: motion of its end (k,) by a correction at each knot, the same on each
+    axis; bend: its motion, y + iz, per mm of path on which the bevel keeps its side. The miss with the rolls of a
+    sample follows by the linear model. The guide's correction is random, and a second one in a random direction as
+    large as undoes 0 to 1.2 of that miss. A third of the samples have only the second, a sixth leave the guide alone.
     """
-    count, best = len(tried), int(np.argmin(costs))
-    lever = fit_lever(ahead, tried, misses, costs)
+    count, used = len(z), ahead.bevel_use(z)
+    misses = miss + bend * (used - used[0])
     change, along = _vary_guide(ahead, count, rng)
-    miss = misses[best] if ahead.axes == 2 else misses[best].real
-    change = undo_miss(change, along, lever, rng.uniform(0.0, _OVERSHOOT, count) * miss)
+    missed = misses if ahead.axes == 2 else misses.real
+    change = undo_miss(change, along, lever, rng.uniform(0.0, _OVERSHOOT, count) * missed)
     change[0] = 0.0
-    z = np.tile(tried[best], (count, 1))
-    z[:, : ahead.knots] += np.concatenate([change.real, change.imag], axis=1)[:, : ahead.knots]
-    z[1::8, ahead.knots :] = tried[rng.integers(0, count, len(z[1::8])), ahead.knots :]
-    aimed: Floats = np.clip(z, *ahead.bounds)
-    return aimed
-
-
-def fit_lever(ahead: Ahead, tried: Floats, misses: Laterals, costs: Floats) -> Floats:
-    """Return the derivative (k,) of the miss to the corrections at the knots, the same on each axis of the guide.
-
-    It is fitted to the differences of samples from the first that have its rolls; 0 if the first has no finite cost.
-    """
-    alone = (tried[:, ahead.knots :] == tried[0, ahead.knots :]).all(axis=1) & np.isfinite(costs)
-    if not alone[0]:
-        return np.zeros(KNOTS.size)
-    rows = (tried[alone, : ahead.knots] - tried[0, : ahead.knots]).reshape(-1, KNOTS.size)
-    moved = misses[alone] - misses[0]
-    right = np.stack([moved.real, moved.imag], axis=1)[:, : ahead.axes].ravel()
-    size = np.linalg.norm(rows, axis=1)
-    used = size > 0.0
-    # By their size, since the response is less linear to larger corrections.
-    lever: Floats = np.linalg.lstsq(rows[used] / size[used, None], right[used] / size[used], rcond=_RANK)[0]
-    return lever
+    change[_UNAIMED::12] = 0.0
+    change[_UNAIMED + 1 :: 12] = 0.0
+    aimed = z.copy()
+    aimed[:, : ahead.knots] = np.concatenate([change.real, change.imag], axis=1)[:, : ahead.knots]
+    return np.clip(aimed, *ahead.bounds)
 
 
 def _vary_guide(ahead: Ahead, count: int, rng: np.random.Generator) -> tuple[Laterals, Floats]:

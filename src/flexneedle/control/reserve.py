@@ -24,7 +24,7 @@ _SHARES = (0.0, 1.0 / 3.0, 2.0 / 3.0)  # of the path without the guide, at which
 class Lever:
     """Effect on the tip at the target of corrections of the guide at the knots of a path."""
 
-    depth: Floats  # depths of path's begin and knots (k + 1,), mm
+    depth: Floats  # depths of the begin of the path and of its knots (k + 1,), mm
     effect: Floats  # lateral motion of the end per correction (k,)
 
     @staticmethod
@@ -58,7 +58,7 @@ def reserve_of_bevel(
     ahead: Ahead,
     outlook: Outlook,
     lever: Lever,
-    constant: Trajectories,
+    bend: complex,
     target: Point,
     *,
     least: float,
@@ -66,12 +66,10 @@ def reserve_of_bevel(
 ) -> Reserve:
     """Return the reserve from the depth on where the guide's lever is below `least`.
 
-    constant: trajectories of `ahead.constant`; margin: factor on the standard deviations.
+    bend: lateral motion of the end, mm per mm of path on which the bevel keeps its side; margin: factor on the standard
+    deviations.
     """
     begin = min(max(lever.lost_from(least), float(ahead.depth[0])), float(ahead.depth[-1]))
     begins = begin + np.array(_SHARES) * (ahead.depth[-1] - begin)
     sds = margin * np.array([outlook.sd_after(estimate, target[0], depth) for depth in begins])
-    kept, _, rolled, _ = past_target(constant.tips, target)
-    return Reserve(
-        begins, sds, 0.5 * abs(kept - rolled) / max(ahead.left, ahead.advance), not ahead.setup.half_turns
-    )
+    return Reserve(begins, sds, abs(bend), not ahead.setup.half_turns)

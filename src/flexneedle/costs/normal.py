@@ -9,23 +9,12 @@ from flexneedle.types import Floats
 _CERTAIN = 1e-9  # standard deviation of a value that is known
 
 
-def mean_above_zero(mean: Floats, sd: Floats | float) -> Floats:
-    """Return the mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
-    above, bell = _tail(mean, sd)
-    part: Floats = mean * above + bell
-    return part
-
-
-def mean_square_above_zero(mean: Floats, sd: Floats | float) -> Floats:
-    """Return the mean square of the part above zero of normal values: ∫₀^∞ x² N(mean, sd²) dx."""
-    above, bell = _tail(mean, sd)
-    part: Floats = (mean**2 + np.square(sd)) * above + mean * bell
-    return part
-
-
-def _tail(mean: Floats, sd: Floats | float) -> tuple[Floats, Floats]:
-    """Return the probability of a value above zero, and the density at zero times the variance."""
+def moments_above_zero(mean: Floats, sd: Floats | float) -> tuple[Floats, Floats]:
+    """Return mean and mean square of the part above zero of normal values: ∫₀^∞ xⁿ N(mean, sd²) dx, n = 1, 2."""
     width = np.maximum(sd, _CERTAIN)
     z = mean / width
-    above = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z.tolist()])
-    return above, width * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    above = 0.5 * np.array([math.erfc(value) for value in (-math.sqrt(0.5) * z).ravel().tolist()]).reshape(
+        z.shape
+    )
+    bell = width * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    return mean * above + bell, (mean**2 + width**2) * above + mean * bell

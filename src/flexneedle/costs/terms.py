@@ -26,7 +26,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.costs.normal import mean_above_zero, mean_square_above_zero
+from flexneedle.costs.normal import moments_above_zero
 from flexneedle.costs.weighted_sum import Cost, Trajectories, Weight, cost_term
 from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, X, Y, across
 
@@ -161,7 +161,7 @@ def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
 @cost_term(
     "mm",
     adaptive_mpc=Weight(
-        "travel", "travel_weight", "–", 0.08,
+        "travel", "travel_weight", "–", 0.12,
         "Weight of the guide's travel in the tissue: it moves only where that lowers the rest of the cost by more.",
         "larger for less guide motion at the expense of accuracy.",
     ),
@@ -264,19 +264,12 @@ def lost_reserve(
     advance = trajectories.controls[:, :, DB_X]
     turns = trajectories.controls[:, :, ROLL] + trajectories.controls[:, :, SPIN]
     bevel = np.exp(1j * np.cumsum(turns, axis=1))
-    costs = [np.zeros(len(advance))]
-    for begin, sd in zip(begins, sds, strict=True):
-        after = reach * np.clip(trajectories.tips[:, :, X] - begin, 0.0, advance)
-        used, most = (after * bevel).sum(axis=1), after.sum(axis=1)
-        sides = [np.abs(used)] if any_angle else [used.real, -used.real]
-        costs.append(np.sum([expected_miss(side - most, sd, precision) for side in sides], axis=0))
-    worst: Floats = np.max(costs, axis=0)
+    after = reach * np.clip(trajectories.tips[:, :, X] - begins[:, None, None], 0.0, advance)
+    used, most = (after * bevel).sum(axis=2), after.sum(axis=2)
+    sides = np.stack([np.abs(used)] if any_angle else [used.real, -used.real])
+    first, second = moments_above_zero(sides - most, sds[:, None])
+    worst: Floats = (first + second / precision).sum(axis=0).max(axis=0, initial=0.0)
     return worst
-
-
-def expected_miss(mean: Floats, sd: float, precision: float) -> Floats:
-    """Return the mean cost (mm), as in `miss`, of normal distances (mm), those below zero free."""
-    return mean_above_zero(mean, sd) + mean_square_above_zero(mean, sd) / precision
 
 
 @cost_term("mm²", ce_mpc=Weight("deviation"))

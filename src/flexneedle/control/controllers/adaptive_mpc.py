@@ -2,9 +2,10 @@
 
 Start, needle, guide and tissue are identified (`estimation.identification`). The current path, the guide over depth and
 the depths at which the bevel rolls, is first the plan's (`control.path`). A better one is searched among its
-corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. With a guide there
-are two rounds: corrections on many scales, then corrections of the best that are aimed at the target, by the effect of
-the guide that the first round showed. With the bevel alone, cross-entropy refines the first samples.
+corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. With a guide they
+are aimed at the target: by the effect of guide and bevel on the end, which is known from the period before and from the
+current path, the guide undoes the miss that rolls and random corrections would leave. With the bevel alone,
+cross-entropy refines the samples.
 
 The cost is a length, so that one setting serves every needle and tissue: the miss and its square, the tissue energy at
 the target, in the mean and at its peak, the guide's travel and slope, rolls, and loads near the limits of the guard.
@@ -16,8 +17,7 @@ Each decision comes with the predicted miss and its standard deviation (`control
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -29,9 +29,9 @@ from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook, predict_ends
 from flexneedle.control.path import KNOTS, Ahead, GuidePath, aim_samples, path_of_plan, propose_samples
 from flexneedle.control.reserve import NO_RESERVE, Lever, reserve_of_bevel
-from flexneedle.costs.normal import mean_above_zero
+from flexneedle.costs.normal import moments_above_zero
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target, per_energy
-from flexneedle.costs.weighted_sum import TIPS_ONLY, RolloutFunction, Term, Trajectories, Wanted, outputs_of
+from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.lateral import bevel_directions
@@ -43,7 +43,7 @@ from flexneedle.results import format_mm
 from flexneedle.scenario.sections.fields import NonNegative, Positive, count
 from flexneedle.scenario.sections.weights import drop_old_keys, with_weights
 from flexneedle.simulator.excess import LoadLimits
-from flexneedle.types import STILL, Floats, Shape, X, Y, Z, laterals
+from flexneedle.types import STILL, Floats, Laterals, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
 _SMOOTHING = 0.3
@@ -60,6 +60,7 @@ _OLD_KEYS = (
     "unguided_line_weight",
     "reach_weight",
 )
+_MORE_ALONE = 2  # factor on the samples with the bevel alone
 _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
@@ -69,9 +70,9 @@ class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 
     samples: int = count(48, least=12, most=100_000)
-    """Paths per iteration of the search; twice as many if the guide may not move."""
+    """Paths per search; twice as many per iteration if the guide may not move."""
     iterations: int = count(2, least=1, most=1_000)
-    """Iterations per control period. With a guide, those after the first have samples aimed at the target."""
+    """Iterations per control period if the guide may not move."""
     effort: int = count(3, least=1, most=1_000)
     """Factor on `samples` in the first period, and in a repeated search if no path ends within
     `control.miss_limit_mm`."""
@@ -127,11 +128,15 @@ def decide(
     settings = task.settings
     current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled
     ahead = Ahead.of(task, fitted.state, current)
-    found = search_path(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
+    begins = not memory.outlook
+    # With a guide, the first search at the start shows the lever only.
+    found = search_path(task, fitted, ahead, memory, settings.effort if begins and not ahead.step else 1, rng)
     if not math.isfinite(found.cost):
         return Decision(STILL, "no path converges on the fitted model", found.cost), memory
     forecast = _forecast(task, memory, fitted, ahead, found)
-    if probability_beyond(task.scenario.control.miss_limit_mm, forecast.miss, forecast.sd) > _LOST:
+    lost = probability_beyond(task.scenario.control.miss_limit_mm, forecast.miss, forecast.sd) > _LOST
+    if lost or (begins and ahead.step):
+        memory = replace(memory, outlook=forecast.outlook, lever=forecast.lever)
         ahead = Ahead.of(task, fitted.state, ahead.correct(found.z))
         found = search_path(task, fitted, ahead, memory, settings.effort, rng)
         forecast = _forecast(task, memory, fitted, ahead, found)
@@ -183,46 +188,36 @@ def search_path(
 ) -> Found:
     """Return the best correction of the current path, which is itself among the samples.
 
-    With a guide, each later iteration aims its samples by the samples before them; with the bevel alone, cross-entropy
-    draws them.
+    Where the guide moves and its lever is known, the samples are aimed at the target; with the bevel alone,
+    cross-entropy refines them.
     """
-    settings, target = task.settings, task.plan.target
+    settings, lower, upper = task.settings, *ahead.bounds
     guided = ahead.step > 0.0
-    aimed = settings.iterations - 1 if guided else 0
-    count = effort * settings.samples * (1 if guided else 2)
-    z = propose_samples(ahead, count, rng, _aim_of_rolls(task, fitted, ahead))
-    charged = cost_terms(task, fitted, memory, ahead)
+    count = effort * settings.samples * (1 if guided else _MORE_ALONE)
+    ends = find_ends(task, fitted, ahead)
+    known = np.isfinite(ends).all()
+    z = propose_samples(ahead, count, rng, complex(-ends[0]) if known and not ahead.setup.half_turns else 1.0)
+    if guided and known and memory.lever:
+        z = aim_samples(ahead, z, complex(ends[0]), memory.lever.effect, bend_of(ahead, ends), rng)
+    charged = cost_terms(task, fitted, memory, ahead, ends)
     rollout = partial(rollout_as_measured, fitted, wanted=outputs_of(charged))
-    search = partial(_search_from, ahead, rollout, charged, settings.iterations - aimed, rng)
-    found = search(z)
-    for _ in range(aimed):
-        z = aim_samples(ahead, z, past_target(found.samples.tips, target), found.samples.costs, rng)
-        found = search(z)
-    return found
+    variables = Variables(lower, upper, z[0], z.std(axis=0), lambda z: ahead.controls(z)[0])
+    rounds = 1 if guided else settings.iterations
+    search = Search(count, elite_count(count, _ELITE_FRACTION), rounds, _SMOOTHING, _TOLERANCE)
+    return find_best(variables, rollout, charged, search, rng, first=z)
 
 
-def _search_from(
-    ahead: Ahead,
-    rollout: RolloutFunction,
-    charged: Sequence[Term],
-    iterations: int,
-    rng: np.random.Generator,
-    first: Floats,
-) -> Found:
-    """Return the best sample found by cross-entropy that begins with the samples `first` (N, d)."""
-    lower, upper = ahead.bounds
-    variables = Variables(lower, upper, first[0], first.std(axis=0), lambda z: ahead.controls(z)[0])
-    count = len(first)
-    search = Search(count, elite_count(count, _ELITE_FRACTION), iterations, _SMOOTHING, _TOLERANCE)
-    return find_best(variables, rollout, charged, search, rng, first=first)
+def find_ends(task: Task, fitted: Identified, ahead: Ahead) -> Laterals:
+    """Return the lateral misses y + iz (5,), mm, of the current path and of `ahead.constant`; NaN if one fails."""
+    rows = np.concatenate([ahead.controls(ahead.current[None])[0], ahead.constant])
+    trajectories = rollout_as_measured(fitted, rows)
+    past: Laterals = past_target(trajectories.tips, task.plan.target)
+    return past if trajectories.converged.all() else np.full_like(past, np.nan)
 
 
-def _aim_of_rolls(task: Task, fitted: Identified, ahead: Ahead) -> complex:
-    """Return the direction from the end of the current path to the target; 1 for a needle that rolls by half turns."""
-    if ahead.setup.half_turns:
-        return 1.0
-    along = rollout_as_measured(fitted, ahead.controls(ahead.current[None])[0])
-    return complex(-past_target(along.tips, task.plan.target)[0])
+def bend_of(ahead: Ahead, ends: Laterals) -> complex:
+    """Return the motion y + iz of the end, mm per mm of path on which the bevel keeps its side, of `find_ends`."""
+    return complex(0.5 * (ends[1] - ends[3]) / max(ahead.left, ahead.advance))
 
 
 def rollout_as_measured(fitted: Identified, controls: Floats, wanted: Wanted = TIPS_ONLY) -> Trajectories:
@@ -236,8 +231,10 @@ def rollout_as_measured(fitted: Identified, controls: Floats, wanted: Wanted = T
     return predicted
 
 
-def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
-    """Return the terms of the cost of a path, in mm."""
+def cost_terms(
+    task: Task, fitted: Identified, memory: Memory, ahead: Ahead, ends: Laterals
+) -> tuple[Term, ...]:
+    """Return the terms of the cost of a path, in mm; ends (5,): of `find_ends`."""
     settings, target = task.settings, task.plan.target
     uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
     guided = guide_may_move(task.scenario.setup, task.plan.strategy) and not _bevel_alone_across(task, ahead)
@@ -249,20 +246,15 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
     weights["late"] *= fitted.roll_sd
     weights["guide force"] = weights["limits"] if math.isfinite(memory.loads.force) else 0.0
     expected, angle, reserve = np.zeros(2), 0.0, NO_RESERVE
-    if not guided:
-        expected, angle = expected_out_of_reach(task, fitted, ahead, memory, settings.unguided_reach_margin)
-    elif memory.outlook and memory.lever:
-        constant = rollout_as_measured(fitted, ahead.constant)
-        reserve = reserve_of_bevel(
-            fitted,
-            ahead,
-            memory.outlook,
-            memory.lever,
-            constant,
-            target,
-            least=settings.travel_weight,
-            margin=settings.reserve_margin,
+    known, outlook, lever = np.isfinite(ends).all(), memory.outlook or Outlook.of(fitted), memory.lever
+    if known and not guided:
+        expected, angle = expected_out_of_reach(
+            task, fitted, ahead, outlook, ends, settings.unguided_reach_margin
         )
+    elif known and lever:
+        least, margin = settings.travel_weight, settings.reserve_margin
+        bend = bend_of(ahead, ends)
+        reserve = reserve_of_bevel(fitted, ahead, outlook, lever, bend, target, least=least, margin=margin)
     weights["reach"] *= not guided
     weights["reserve"] *= bool(reserve.sds.any())
     return ADAPTIVE_MPC.terms(
@@ -280,7 +272,7 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
 
 
 def expected_out_of_reach(
-    task: Task, fitted: Identified, ahead: Ahead, memory: Memory, margin: float
+    task: Task, fitted: Identified, ahead: Ahead, outlook: Outlook, ends: Laterals, margin: float
 ) -> tuple[Floats, float]:
     """Return the expected distances (2,), mm, of the target from the bevel's reach after the first step, and an angle.
 
@@ -292,15 +284,12 @@ def expected_out_of_reach(
     later step will need may be given away, but lost reach cannot be regained by the bevel alone. Along the axis of a
     guide that moves on one, the guide corrects, so that only the distance across it counts.
     """
-    trajectories = rollout_as_measured(fitted, ahead.constant)
-    if not trajectories.converged.all():
-        return np.zeros(2), 0.0
-    past = past_target(trajectories.tips, task.plan.target).reshape(2, 2)
-    middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
+    past = ends[1:].reshape(2, 2)
+    middle = outlook.sd_now(fitted, task.plan.target[0])
     if ahead.setup.half_turns:
         low, high = past.real.min(axis=1), past.real.max(axis=1)
         sd = margin * np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
-        return mean_above_zero(low, sd) + mean_above_zero(-high, sd), 0.0
+        return moments_above_zero(low, sd)[0] + moments_above_zero(-high, sd)[0], 0.0
     # By symmetry the ends are the same along any direction of the bevel. The first step displaces their middle towards
     # the target or away from it, and the ends with it.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
@@ -308,7 +297,7 @@ def expected_out_of_reach(
         away = 1j * away.imag
     sd = margin * np.hypot(middle, radius * fitted.bevel_sd)
     angle = float(np.angle(complex(away) * fitted.state.bevel.conjugate()))
-    return mean_above_zero(abs(away) - radius, sd), angle
+    return moments_above_zero(abs(away) - radius, sd)[0], angle
 
 
 def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
