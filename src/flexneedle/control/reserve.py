@@ -41,7 +41,7 @@ class Lever:
 
 
 class Reserve(NamedTuple):
-    """What the term `lost_reserve` takes: depths (mm), bevel, and unknowns, where the guide has no effect."""
+    """Arguments of the term `lost_reserve`: the bevel, and the unknowns, where the guide has no effect."""
 
     begins: Floats  # depths (b,), mm
     sds: Floats  # standard deviations (b,), mm, of the uncorrected end that readings to come will show below them
@@ -50,7 +50,7 @@ class Reserve(NamedTuple):
 
 
 NO_RESERVE = Reserve(np.zeros(0), np.zeros(0), 0.0, any_angle=False)
-"""Where nothing is charged."""
+"""No charge."""
 
 
 def reserve_of_bevel(
