@@ -41,7 +41,7 @@ _WEIGHTS = {"plan": PLAN, "control.ce_mpc": CE_MPC, "control.adaptive_mpc": ADAP
 NOT_NEGATIVE = [f"{section}.{weight.key}" for section, cost in _WEIGHTS.items() for weight in cost.settings()]
 NOT_NEGATIVE += _keys("""
     control: load_gain start_offset_sd_mm start_angle_sd_mrad start_axial_sd_mm axial_scale_sd
-    control.adaptive_mpc: unguided_reach_margin clearance_mm clearance_sd_mm model_sd bend_sd_mm
+    control.adaptive_mpc: unguided_reach_margin reserve_margin clearance_mm clearance_sd_mm model_sd bend_sd_mm
     control.adaptive_mpc: run_out_sd_mm tilt_sd_mrad modulus_log_sd bevel_sd boundary_sd_mm variation_sd
     control.adaptive_mpc: residual_gain
     control.bevel_only: curvature_per_m flip_dead_band

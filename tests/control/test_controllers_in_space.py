@@ -74,7 +74,7 @@ def plans():
         ("one axis", "open-loop", 0.05),
         *(
             pytest.param("one axis", controller, most, marks=pytest.mark.long)
-            for controller, most in (("adaptive-mpc", 0.15), ("ce-mpc", 0.3), ("resolved-rate", 0.3))
+            for controller, most in (("adaptive-mpc", 0.3), ("ce-mpc", 0.3), ("resolved-rate", 0.3))
         ),
         ("no guide", "open-loop", 0.05),
         ("no guide", "adaptive-mpc", 0.2),
