@@ -90,6 +90,14 @@ def test_a_needle_without_a_bevel_has_no_factor_to_bound():
     assert np.isfinite(prior.precision).all()
 
 
+@pytest.mark.parametrize(("sd", "step"), [(1.5, -1.0), (0.0, -0.2)])
+def test_a_boundary_is_moved_towards_the_skin(sd, step):
+    """One just ahead of the target has an effect in this direction only."""
+    scenario = PHANTOM.with_values({"control.adaptive_mpc.boundary_sd_mm": sd})
+    prior = Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings, 40.0)
+    np.testing.assert_allclose(prior.steps[AT.shift : AT.cells], step)
+
+
 @pytest.mark.parametrize("number", range(12))
 def test_a_prior_is_proper_in_any_world(number):
     """It has full rank, a mean within its bounds, and a depth from which each parameter matters."""

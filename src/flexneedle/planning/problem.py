@@ -89,12 +89,12 @@ class PlanProblem:
 
     @property
     def narrow(self) -> bool:
-        """Whether the driver's range is less than a turn, so that the bevel cannot face every direction."""
+        """True if the driver's range is less than a turn: the bevel cannot face every direction."""
         return not self.half_turns and self.rotation < np.pi
 
     @property
     def bevel_alone(self) -> bool:
-        """Whether only the bevel steers: neither base nor guide is free."""
+        """True if only the bevel steers: neither base nor guide is free."""
         return not self.sigma[LATERAL : self.bevel.start].any()
 
     @property
