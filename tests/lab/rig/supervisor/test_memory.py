@@ -7,7 +7,7 @@ from itertools import count, islice
 from flexneedle.lab.rig.supervisor import protocol
 from stages import Bench
 
-WARM, STEPS = 180, 40
+WARM, STEPS = 180, 200
 
 
 def move(bench, numbers, steps):
@@ -28,11 +28,10 @@ def test_ticks_make_no_cycles_and_keep_no_memory():
     gc.collect()
     gc.disable()
     try:
-        grown = [count_kept_blocks(bench, numbers) for _ in range(3)]
+        # Less than half a block for each step. Three rounds: Python and other threads of the tests keep some once.
+        assert any(count_kept_blocks(bench, numbers) < STEPS // 2 for _ in range(3))
     finally:
         gc.enable()
-    # Less than half a block for each step. The least: Python and other threads of the tests keep some once.
-    assert min(grown) < STEPS // 2
 
 
 def count_kept_blocks(bench, numbers):
