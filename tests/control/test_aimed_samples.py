@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 
 from adaptive import PHANTOM, estimate_of, rolls_at
+from flexneedle.control import path as path_module
 from flexneedle.control.controllers import adaptive_mpc
-from flexneedle.control.path import KNOTS, Ahead, GuidePath, aim_samples, propose_samples, undo_miss
+from flexneedle.control.path import (
+    KNOTS,
+    Ahead,
+    GuidePath,
+    add_pairs,
+    aim_samples,
+    propose_samples,
+    undo_miss,
+)
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from synthetic import make_plan
@@ -19,13 +28,13 @@ AXES = pytest.mark.parametrize("axes", [1, 2])
 COUNT = 96
 
 
-def prepared(axes):
-    """Estimate and path ahead of a needle 10 mm deep, whose current path keeps the guide and rolls twice."""
+def prepared(axes, rolls=(15.0, 30.0)):
+    """Estimate and path ahead of a needle 10 mm deep, whose current path keeps the guide and rolls at depths."""
     scenario = PHANTOM.with_values({"setup.axes": axes})
     simulator = Simulator(scenario, threads=1)
     state, _ = simulator.replay(simulator.start(), controls(38, db_x=1.0))
     plan = replace(make_plan("manipulation", (40.0, 0.5, 0.2 * (axes - 1)), 0), scenario=scenario)
-    path = GuidePath(np.array([-50.0, 60.0]), np.tile(state.guide, (2, 1)), rolls_at(15.0, 30.0))
+    path = GuidePath(np.array([-50.0, 60.0]), np.tile(state.guide, (2, 1)), rolls_at(*rolls))
     estimate = estimate_of(state, scenario)
     return estimate, Ahead.of(task_of(estimate.nominal, plan), state, path)
 
@@ -33,12 +42,13 @@ def prepared(axes):
 BEND = {1: 0.05 + 0.0j, 2: 0.04 + 0.03j}  # mm per mm of path on one side, by axes
 
 
-def linear_misses(ahead, z):
+def linear_misses(ahead, z, miss=None):
     """Misses y + iz (N,) of samples whose guide and bevel move the end linearly."""
+    miss = MISS[ahead.axes] if miss is None else miss
     moved = z[:, : ahead.knots].reshape(-1, ahead.axes, KNOTS.size) @ LEVER
     used = ahead.bevel_use(z)
     rolled = BEND[ahead.axes] * (used - ahead.bevel_use(ahead.current[None]))
-    misses = MISS[ahead.axes] + moved @ np.array([1.0, 1.0j])[: ahead.axes] + rolled
+    misses = miss + moved @ np.array([1.0, 1.0j])[: ahead.axes] + rolled
     return misses if ahead.axes == 2 else misses.real
 
 
@@ -48,12 +58,17 @@ def proposed_and_aimed(ahead, lever=LEVER, miss=None):
     return proposed, aim_samples(ahead, proposed, miss, lever, BEND[ahead.axes], np.random.default_rng(2))
 
 
+def paired(proposed, aimed, ahead):
+    """Whether each sample got a pair of rolls (N,)."""
+    return (aimed[:, ahead.knots :] != proposed[:, ahead.knots :]).any(axis=1)
+
+
 @AXES
-def test_the_first_sample_corrects_nothing_and_all_keep_their_rolls(axes):
+def test_the_first_sample_corrects_nothing_and_most_keep_their_rolls(axes):
     _, ahead = prepared(axes)
     proposed, aimed = proposed_and_aimed(ahead)
     np.testing.assert_array_equal(aimed[0], ahead.current)
-    np.testing.assert_array_equal(aimed[:, ahead.knots :], proposed[:, ahead.knots :])
+    assert paired(proposed, aimed, ahead).sum() <= COUNT // 6
     assert (aimed[:, ahead.knots :] != ahead.current[ahead.knots :]).any(axis=1).sum() > COUNT // 2
 
 
@@ -66,7 +81,8 @@ def test_a_linear_response_leaves_a_share_of_the_miss_with_the_rolls(axes):
     unmoved[:, : ahead.knots] = 0.0
     lower, upper = ahead.bounds
     free = ((aimed > lower) & (aimed < upper))[:, : ahead.knots].all(axis=1)
-    assert free.sum() > 0.8 * COUNT
+    free &= ~paired(proposed, aimed, ahead)
+    assert free.sum() > 0.7 * COUNT
     share = linear_misses(ahead, aimed)[free] / linear_misses(ahead, unmoved)[free]
     np.testing.assert_allclose(share.imag, 0.0, atol=1e-9)
     assert -0.2 - 1e-9 <= share.real.min() < -0.1
@@ -75,12 +91,38 @@ def test_a_linear_response_leaves_a_share_of_the_miss_with_the_rolls(axes):
 
 
 @AXES
-def test_a_sixth_leave_the_guide_as_it_is_and_have_other_rolls(axes):
+def test_some_leave_the_guide_as_it_is_and_have_other_rolls(axes):
     _, ahead = prepared(axes)
     _, aimed = proposed_and_aimed(ahead)
     still = (aimed[:, : ahead.knots] == 0.0).all(axis=1)
-    assert still[1:].sum() == COUNT // 6
+    assert COUNT // 12 <= still[1:].sum() <= COUNT // 6
     assert (aimed[1:][still[1:]] != ahead.current).any(axis=1).all()
+
+
+@pytest.mark.parametrize("rolls", [(), (15.0,), (15.0, 30.0)])
+@pytest.mark.parametrize("turn", [0.0, 0.7, -1.2])
+@AXES
+def test_pairs_of_rolls_undo_the_miss(axes, turn, rolls, monkeypatch):
+    """Exactly if no other roll is between the two: along the chord from the bevel's direction."""
+    monkeypatch.setattr(path_module, "_SPREAD", 0.0)
+    _, ahead = prepared(axes, rolls)
+    # The bevel on the present side moves the end further from the target; after a half turn, towards it.
+    miss = 0.3 * BEND[axes] / abs(BEND[axes]) * np.exp(1j * turn * (axes - 1))
+    proposed, aimed = proposed_and_aimed(ahead, miss=miss)
+    left = np.abs(linear_misses(ahead, aimed, miss))[paired(proposed, aimed, ahead)]
+    assert left.size >= COUNT // 24
+    assert (left < 1e-9).all() if not rolls else (left < 1e-9).any()
+
+
+def test_no_pair_is_added_without_slots_or_where_the_bevel_has_no_effect():
+    _, ahead = prepared(1, (12.0, 15.0, 20.0))
+    proposed, aimed = proposed_and_aimed(ahead)
+    assert not paired(proposed, aimed, ahead).any()
+    _, ahead = prepared(1)
+    which, misses = np.ones(COUNT, dtype=bool), np.full(COUNT, 0.4 + 0.0j)
+    same, made = add_pairs(ahead, proposed, which, misses, 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(same, proposed)
+    assert not made.any()
 
 
 def test_a_third_of_the_samples_move_the_guide_to_one_side_at_all_knots():

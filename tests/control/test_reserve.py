@@ -35,26 +35,31 @@ def test_the_lever_is_the_motion_of_the_end_by_a_correction(quick_plan, along):
     assert (past[1] - past[0]).real == pytest.approx(0.05 * memory.lever.effect.sum(), rel=0.05)
 
 
-def test_the_reserve_begins_where_the_lever_is_lost_and_knows_more_the_deeper(quick_plan, along):
+def test_the_reserve_has_depths_by_the_lever_and_knows_more_the_deeper(quick_plan, along):
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     memory = decided(quick_plan, estimate)[1]
     ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, memory.path)
     ends = adaptive_mpc.find_ends(task_of(estimate.nominal, quick_plan), estimate, ahead)
     bend = adaptive_mpc.bend_of(ahead, ends)
+    lever = Lever(
+        ahead.depth[0] + ahead.left * np.array([0.0, 0.25, 0.5, 0.75, 1.0]), np.array([0.4, 0.4, 0.1, 0.1])
+    )
 
     def found(least, margin):
         return reserve_of_bevel(
-            estimate, ahead, memory.outlook, memory.lever, bend, quick_plan.target,
-            least=least, margin=margin,
-        )  # fmt: skip
+            estimate, ahead, memory.outlook, lever, bend, quick_plan.target, least=least, margin=margin
+        )
 
-    whole, half = found(1e9, 2.0), found(1e9, 1.0)
-    assert whole.begins[0] == ahead.depth[0]
-    assert (np.diff(whole.begins) > 0.0).all()
-    assert whole.begins[-1] < quick_plan.target[0]
-    assert (np.diff(whole.sds) <= 0.0).all()
-    assert whole.sds[0] > whole.sds[-1] > 0.0
-    np.testing.assert_allclose(whole.sds, 2.0 * half.sds)
+    some = found(0.2, 2.0)
+    shares = (
+        some.begins - ahead.depth[0]
+    ) / ahead.left  # where the effects left are 0.8, 0.4 and 0.2, and beyond
+    np.testing.assert_allclose(shares, [0.125, 0.375, 0.5, 0.5 + 0.5 / 3.0, 0.5 + 1.0 / 3.0])
+    np.testing.assert_array_equal(some.prices, [0.25, 0.5, 1.0, 1.0, 1.0])
+    assert (np.diff(some.sds) <= 0.0).all()
+    assert some.sds[0] > some.sds[-1] > 0.0
+    np.testing.assert_allclose(some.sds, 2.0 * found(0.2, 1.0).sds)
     _, kept, _, rolled, _ = ends
-    assert 2.0 * whole.reach * ahead.left == pytest.approx(abs(kept - rolled))
-    assert found(0.0, 1.0).begins[0] == pytest.approx(ahead.depth[-1])
+    assert 2.0 * some.reach * ahead.left == pytest.approx(abs(kept - rolled))
+    assert (found(1e9, 1.0).begins[:3] == ahead.depth[0]).all()
+    np.testing.assert_allclose(found(0.0, 1.0).begins, ahead.depth[-1])

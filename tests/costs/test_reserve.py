@@ -1,7 +1,5 @@
 """Expected costs of normal values, and the reserve of the bevel."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -34,21 +32,27 @@ def path_of(*rolls, angle=np.pi):
     return Trajectories(rows, tips, np.zeros((1, STEPS)), np.ones((1, STEPS), dtype=bool))
 
 
-reserve = partial(terms.lost_reserve, reach=0.05, precision=0.03, any_angle=False)
+def reserve(path, begins, sds, price=1.0, *, any_angle=False):
+    """Reserve of a needle that bends by 0.05, at one price."""
+    return terms.lost_reserve(
+        path, begins, sds, np.full(begins.shape, price), 0.05, 0.03, any_angle=any_angle
+    )
 
 
 @pytest.mark.parametrize("rolls", [(), (10.0,), (5.0, 12.0), (14.0,)])
 @pytest.mark.parametrize("begin", [0.0, 8.0])
-def test_the_reserve_is_what_correcting_a_random_miss_by_rolls_leaves(rolls, begin):
-    """The reference draws misses, and corrects each by the nearest end that any rolls below the depth can reach."""
+@pytest.mark.parametrize("price", [1.0, 0.25])
+def test_the_reserve_is_what_correcting_a_random_miss_by_rolls_leaves(rolls, begin, price):
+    """The reference draws misses, corrects each by the nearest end that any rolls below the depth can reach, and pays
+    for the rest."""
     sd, draws = 0.3, np.random.default_rng(0).normal(0.0, 0.3, 200_000)
     sides = (-1.0) ** np.searchsorted(np.sort(rolls), DEPTH - STEP, side="right")
     below = begin <= DEPTH - STEP
     used, most = 0.05 * STEP * sides[below].sum(), 0.05 * STEP * below.sum()
     wanted = used - draws
     left = np.abs(wanted - np.clip(wanted, -most, most))
-    expected = terms.charge_miss(left, 0.03).mean()
-    found = reserve(path_of(*rolls), begins=np.array([begin]), sds=np.array([sd]))[0]
+    expected = terms.charge_miss(price * left, 0.03).mean()
+    found = reserve(path_of(*rolls), begins=np.array([begin]), sds=np.array([sd]), price=price)[0]
     assert found == pytest.approx(expected, rel=0.03, abs=2e-3)
 
 

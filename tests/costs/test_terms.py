@@ -73,16 +73,17 @@ def test_an_energy_peak_counts_wherever_it_is():
 
 @pytest.mark.parametrize("shift", [0, 1, 2])
 def test_loads_are_charged_beyond_four_fifths_of_their_limits(shift):
-    """The largest of all steps counts: strain 1.25, compression 1.5, force (3, −4) N 2 times the 80 %."""
-    strain = np.array([[0.0, 0.01, 0.002], [0.008, 0.0, 0.0]])
-    stretch = np.array([[1.0, 0.4, 0.9], [0.6, 1.0, 1.0]])
+    """The largest of all steps counts: 0.9 of the limits, so half as far from them; far beyond 80 % of the force's."""
+    strain = np.array([[0.0, 0.009, 0.002], [0.008, 0.0, 0.0]])
+    stretch = np.array([[1.0, 0.55, 0.9], [0.6, 1.0, 1.0]])
     loads = np.zeros((2, 3, 6))
     loads[0, 1, 4:], loads[1, 1, 4], loads[:, :, :4] = (3.0, -4.0), 2.5, 99.0
     rolled = [np.roll(each, shift, axis=1) for each in (strain, stretch, loads)]
     given = replace(TRAJECTORIES, **dict(zip(("strain", "stretch", "loads"), rolled, strict=True)))
-    for limits, excess in (((0.01, np.inf), 0.25), ((np.inf, 0.5), 0.5), ((0.01, 0.5), 0.25 + 0.5)):
+    for limits, excess in (((0.01, np.inf), 0.25), ((np.inf, 0.5), 0.25), ((0.01, 0.5), 0.25 + 0.25)):
         np.testing.assert_allclose(terms.load_excess(given, *limits), [excess, 0.0], atol=1e-12)
-    np.testing.assert_allclose(terms.guide_force_excess(given, 3.125), [1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(terms.guide_force_excess(given, 3.125), [100.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(terms.guide_force_excess(given, 5.0), [25.0, 0.0], atol=1e-12)
 
 
 def turned(trajectories, angle):

@@ -37,7 +37,12 @@ _WIDEST = 1.0  # largest change of an angle (rad)
 _DECADES = 2.0  # over which the scales of the samples spread
 _FINER_DECADES = (-2.5, -0.3)  # of the scales of samples around the best
 _OVERSHOOT = 1.2  # largest share of a miss that an aimed sample undoes
-_UNAIMED = 3  # the first of a dozen samples whose guide is not aimed: it and the next have other rolls
+_ROLLS_ALONE = (
+    3  # the first of a dozen samples that the bevel aims: it leaves the guide alone, the next does not
+)
+_PAIRS_NOW = 0.5  # share of pairs of rolls that begin now, over those that begin later
+_LEAST_CHORD = 0.1  # motion of the bevel's direction in a pair of rolls, from which it is aimed
+_SPREAD = 0.3  # of the lengths of aimed pairs, logarithmic
 _TURNS = 4.0 * np.pi  # from the present angle, to either side: bounds of an angle
 
 
@@ -176,6 +181,15 @@ class Ahead:
         depth, roll = self._grid(z[:, self.depths], z[:, self.angles])
         used: Laterals = (np.diff(depth, axis=1) * np.exp(1j * np.cumsum(roll, axis=1))).sum(axis=1)
         return used
+
+    def angle_at(self, z: Floats, depth: Floats) -> Floats:
+        """Return the needle's angles (N,), rad, of samples z (N, d) at depths (N,), mm."""
+        before = np.where(z[:, self.depths] < depth[:, None], z[:, self.depths], -np.inf)
+        if self.setup.half_turns:
+            angle: Floats = self.state.roll + np.pi * np.isfinite(before).sum(axis=1)
+            return angle
+        last = z[np.arange(len(z)), self.angles.start + before.argmax(axis=1)]
+        return np.where(np.isfinite(before).any(axis=1), last, self.state.roll)
 
     def _without_rolls(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
         """Return controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
@@ -321,19 +335,59 @@ def aim_samples(
     miss: y + iz, mm, of the current path; lever: motion of its end (k,) by a correction at each knot, the same on each
     axis; bend: its motion, y + iz, per mm of path on which the bevel keeps its side. The miss with the rolls of a
     sample follows by the linear model. The guide's correction is random, and a second one in a random direction as
-    large as undoes 0 to 1.2 of that miss. A third of the samples have only the second, a sixth leave the guide alone.
+    large as undoes 0 to 1.2 of that miss. A third of the samples have only the second. In a sixth the bevel undoes the
+    miss, by a pair of rolls, half of them with a random correction of the guide.
     """
-    count, used = len(z), ahead.bevel_use(z)
+    used, kind = ahead.bevel_use(z), np.arange(len(z)) % 12
+    by_bevel, still = (kind == _ROLLS_ALONE) | (kind == _ROLLS_ALONE + 1), kind == _ROLLS_ALONE
+    change, along = _vary_guide(ahead, len(z), rng)
+    change[0], change[still] = 0.0, 0.0
     misses = miss + bend * (used - used[0])
-    change, along = _vary_guide(ahead, count, rng)
-    missed = misses if ahead.axes == 2 else misses.real
-    change = undo_miss(change, along, lever, rng.uniform(0.0, _OVERSHOOT, count) * missed)
-    change[0] = 0.0
-    change[_UNAIMED::12] = 0.0
-    change[_UNAIMED + 1 :: 12] = 0.0
-    aimed = z.copy()
+    aimed, paired = add_pairs(ahead, z, by_bevel, misses + change @ lever, bend, rng)
+    share = np.where(by_bevel, 0.0, rng.uniform(0.0, _OVERSHOOT, len(z)))
+    undone = undo_miss(change, along, lever, share * (misses if ahead.axes == 2 else misses.real))
+    undone[0], undone[by_bevel] = 0.0, 0.0
+    change = np.where(paired[:, None], change, undone)
     aimed[:, : ahead.knots] = np.concatenate([change.real, change.imag], axis=1)[:, : ahead.knots]
     return np.clip(aimed, *ahead.bounds)
+
+
+def add_pairs(
+    ahead: Ahead,
+    z: Floats,
+    which: NDArray[np.bool_],
+    misses: Laterals,
+    bend: complex,
+    rng: np.random.Generator,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return samples z (N, d), of which some have a pair of rolls that undoes their miss (N,), and which do (N,).
+
+    which: the samples (N,) that are to have one, where the slots and the direction of the bevel allow it. The first
+    roll is anywhere on the path, a third of them now. Over a length w the bevel is turned by φ from its direction β,
+    which moves the end by bend w β (exp(iφ) − 1): along the chord of a circle.
+    """
+    depths, left = ahead.depths, ahead.left
+    free = int((z[0, depths] >= ahead.depth[-1]).sum())
+    if free < 2 or not bend:
+        return z.copy(), np.zeros_like(which)
+    begin = ahead.depth[0] + left * np.maximum(0.0, rng.uniform(-_PAIRS_NOW, 1.0, len(z)))
+    angle = ahead.angle_at(z, begin)
+    wanted = -misses / (bend * np.exp(1j * (angle - ahead.state.roll)))
+    if ahead.setup.half_turns:
+        wanted = wanted.real + 0j
+    towards = np.exp(1j * np.angle(wanted))
+    chord = -2.0 * towards.real  # of exp(iφ) − 1
+    length = np.divide(np.abs(wanted), chord, out=np.full_like(chord, np.inf), where=chord > _LEAST_CHORD)
+    length *= np.exp(_SPREAD * rng.standard_normal(len(z)))
+    made = which & (begin + length < ahead.depth[-1]) & (length > _DUE * ahead.advance)
+    pairs: Floats = z.copy()
+    last = depths.stop
+    pairs[made, last - 2], pairs[made, last - 1] = begin[made], (begin + length)[made]
+    if not ahead.setup.half_turns:
+        last = ahead.angles.stop
+        turned = angle + np.angle(-(towards**2))
+        pairs[made, last - 2], pairs[made, last - 1] = turned[made], angle[made]
+    return pairs, made
 
 
 def _vary_guide(ahead: Ahead, count: int, rng: np.random.Generator) -> tuple[Laterals, Floats]:

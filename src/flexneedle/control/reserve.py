@@ -1,8 +1,10 @@
-"""The reserve of the bevel where the guide has no effect on the tip any more.
+"""The reserve of the bevel for what the readings will show.
 
-The guide's lever on the tip at the target falls with the depth; what readings show later, the bevel alone corrects.
-A path that uses the bevel on one side from there to the target has no correction left to that side. So the expected
-miss that the bevel cannot correct is charged (`costs.terms.lost_reserve`), for what is not yet known at a few depths.
+The guide's lever on the tip at the target falls with the depth: what readings show later costs ever more motion of the
+guide, and in the end the bevel alone corrects it. A path that uses the bevel on one side from some depth to the target
+has no correction left to that side. So the expected miss that the bevel cannot correct is charged
+(`costs.terms.lost_reserve`), for what is not yet known at a few depths, at the price of its correction by the guide
+there: its motion p e for a miss e, and p² e² for the energy in the wake of this motion.
 """
 
 from dataclasses import dataclass
@@ -18,6 +20,7 @@ from flexneedle.estimation.identification import Identified
 from flexneedle.types import Floats, Point
 
 _SHARES = (0.0, 1.0 / 3.0, 2.0 / 3.0)  # of the path without the guide, at which the reserve is compared
+_LEVERS = (4.0, 2.0)  # of the guide at depths before, relative to the least
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +48,12 @@ class Reserve(NamedTuple):
 
     begins: Floats  # depths (b,), mm
     sds: Floats  # standard deviations (b,), mm, of the uncorrected end that readings to come will show below them
+    prices: Floats  # p of a miss that the bevel cannot correct (b,), in mm per mm
     reach: float  # lateral motion of the end, mm per mm of path on which the bevel keeps its side
     any_angle: bool  # whether the needle rolls to any angle
 
 
-NO_RESERVE = Reserve(np.zeros(0), np.zeros(0), 0.0, any_angle=False)
+NO_RESERVE = Reserve(np.zeros(0), np.zeros(0), np.zeros(0), 0.0, any_angle=False)
 """No charge."""
 
 
@@ -64,12 +68,14 @@ def reserve_of_bevel(
     least: float,
     margin: float,
 ) -> Reserve:
-    """Return the reserve from the depth on where the guide's lever is below `least`.
+    """Return the reserve from the depths on where the guide's lever is a few times `least`, or less.
 
-    bend: lateral motion of the end, mm per mm of path on which the bevel keeps its side; margin: factor on the standard
-    deviations.
+    least: lever below which a miss costs less than the guide's motion that corrects it; bend: lateral motion of the
+    end, mm per mm of path on which the bevel keeps its side; margin: factor on the standard deviations.
     """
-    begin = min(max(lever.lost_from(least), float(ahead.depth[0])), float(ahead.depth[-1]))
-    begins = begin + np.array(_SHARES) * (ahead.depth[-1] - begin)
+    levers = [*_LEVERS, 1.0]
+    *before, lost = np.clip([lever.lost_from(k * least) for k in levers], *ahead.depth[[0, -1]]).tolist()
+    begins = np.array([*before, *(lost + share * (ahead.depth[-1] - lost) for share in _SHARES)])
+    prices = np.append(1.0 / np.array(_LEVERS), np.ones(len(_SHARES)))
     sds = margin * np.array([outlook.sd_after(estimate, target[0], depth) for depth in begins])
-    return Reserve(begins, sds, abs(bend), not ahead.setup.half_turns)
+    return Reserve(begins, sds, prices, abs(bend), not ahead.setup.half_turns)

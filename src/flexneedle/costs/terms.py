@@ -38,6 +38,7 @@ ENERGIES = ("end energy", "mean energy", "peak energy")
 """Terms whose weights are per E₁, the energy of all tissue down to the target displaced by 1 mm."""
 SHARE_OF_LIMIT = 0.8
 """Share of a limit of the guard above which a load is charged."""
+_AT_LIMIT = 0.002  # share of a limit
 
 
 def per_energy(weights: Mapping[str, float], scale: float) -> dict[str, float]:
@@ -103,7 +104,7 @@ def deflection(trajectories: Trajectories) -> Floats:
         "`end_energy_weight_mm` for the energy averaged over the advance in the tissue.",
     ),
     adaptive_mpc=Weight(
-        "mean energy", "mean_energy_weight_mm", "mm", 0.3,
+        "mean energy", "mean_energy_weight_mm", "mm", 0.4,
         "`end_energy_weight_mm` for the energy averaged over the path ahead.",
     ),
 )  # fmt: skip
@@ -120,7 +121,7 @@ def mean_energy(trajectories: Trajectories) -> Floats:
         "`end_energy_weight_mm` for the largest energy of all steps.",
     ),
     adaptive_mpc=Weight(
-        "peak energy", "peak_energy_weight_mm", "mm", 0.8,
+        "peak energy", "peak_energy_weight_mm", "mm", 2.0,
         "`end_energy_weight_mm` for the largest energy of the path ahead.",
         "larger to spare the tissue at the expense of accuracy.",
     ),
@@ -137,7 +138,7 @@ def peak_energy(trajectories: Trajectories) -> Floats:
     plan=Weight(
         "limits", "limit_weight_mm", "mm", 100.0,
         "Weight of the needle's strain, the tissue's compression and the guide's force beyond 80 % of their limits in "
-        "`[guard]`, relative to these 80 %.",
+        "`[guard]`, relative to these 80 %; it rises steeply towards the limits.",
     ),
     adaptive_mpc=Weight(
         "limits", "limit_weight_mm", "mm", 100.0,
@@ -145,9 +146,9 @@ def peak_energy(trajectories: Trajectories) -> Floats:
     ),
 )  # fmt: skip
 def load_excess(trajectories: Trajectories, strain: float, compression: float) -> Floats:
-    """Return the excesses max(0, load / (0.8 limit) − 1) of the needle's strain and the tissue's compression, summed.
+    """Return the excesses of the needle's strain and the tissue's compression over 80 % of their limits, summed.
 
-    Of each, the largest of all steps counts.
+    Of each, the largest share r of all steps counts, as max(0, (r / 0.8 − 1) 0.2 / (1 − r)).
     """
     return _excess(trajectories.strain / strain) + _excess((1.0 - trajectories.stretch) / compression)
 
@@ -250,16 +251,18 @@ def lost_reserve(
     trajectories: Trajectories,
     begins: Floats,
     sds: Floats,
+    prices: Floats,
     reach: float,
     precision: float,
     *,
     any_angle: bool,
 ) -> Floats:
-    """Return the expected miss, as in `miss`, that the bevel alone cannot correct, at the worst of some depths.
+    """Return the expected cost, p e + (p e)²/s, of the miss e that the bevel alone cannot correct, at the worst depth.
 
     begins (b,): depths (mm), below which the end will prove to be off by normal distances with the standard deviations
-    `sds` (b,), mm; reach: lateral motion of the end, mm per mm of path on which the bevel keeps its side. On the path
-    from a depth on, of length L, the bevel moves the end by u, |u| ≤ L reach; L reach − |u| is left.
+    `sds` (b,), mm; prices (b,): p there; reach: lateral motion of the end, mm per mm of path on which the bevel keeps
+    its side. On the path from a depth on, of length L, the bevel moves the end by u, |u| ≤ L reach; L reach − |u| is
+    left.
     """
     advance = trajectories.controls[:, :, DB_X]
     turns = trajectories.controls[:, :, ROLL] + trajectories.controls[:, :, SPIN]
@@ -268,7 +271,9 @@ def lost_reserve(
     used, most = (after * bevel).sum(axis=2), after.sum(axis=2)
     sides = np.stack([np.abs(used)] if any_angle else [used.real, -used.real])
     first, second = moments_above_zero(sides - most, sds[:, None])
-    worst: Floats = (first + second / precision).sum(axis=0).max(axis=0, initial=0.0)
+    price = prices[:, None]
+    expected = (price * first + price**2 * second / precision).sum(axis=0)
+    worst: Floats = expected.max(axis=0, initial=0.0)
     return worst
 
 
@@ -321,8 +326,13 @@ def _mean_in_tissue(trajectories: Trajectories, values: Floats) -> Floats:
 
 
 def _excess(shares: Floats) -> Floats:
-    """Return max(0, share / 0.8 − 1) of the largest share of a limit (N, m) of each sequence."""
-    excess: Floats = np.maximum(shares.max(axis=1) / SHARE_OF_LIMIT - 1.0, 0.0)
+    """Return max(0, (r / 0.8 − 1) 0.2 / (1 − r)) of the largest share r of a limit (N, m) of each sequence.
+
+    So no gain outweighs a load at its limit, where 1 − r is `_AT_LIMIT` or less.
+    """
+    share = shares.max(axis=1)
+    left = np.maximum(1.0 - share, _AT_LIMIT) / (1.0 - SHARE_OF_LIMIT)
+    excess: Floats = np.maximum(share / SHARE_OF_LIMIT - 1.0, 0.0) / left
     return excess
 
 

@@ -62,6 +62,9 @@ _OLD_KEYS = (
 )
 _MORE_ALONE = 2  # factor on the samples with the bevel alone
 _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
+_PRICE_OF_ENERGY = (
+    2.0  # cost of a motion of the guide, with the energy in its wake, over the charge on travel
+)
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -252,7 +255,7 @@ def cost_terms(
             task, fitted, ahead, outlook, ends, settings.unguided_reach_margin
         )
     elif known and lever:
-        least, margin = settings.travel_weight, settings.reserve_margin
+        least, margin = _PRICE_OF_ENERGY * settings.travel_weight, settings.reserve_margin
         bend = bend_of(ahead, ends)
         reserve = reserve_of_bevel(fitted, ahead, outlook, lever, bend, target, least=least, margin=margin)
     weights["reach"] *= not guided
