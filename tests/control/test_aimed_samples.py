@@ -59,7 +59,7 @@ def proposed_and_aimed(ahead, lever=LEVER, miss=None):
 
 
 def paired(proposed, aimed, ahead):
-    """Whether each sample got a pair of rolls (N,)."""
+    """Return whether each sample got a pair of rolls (N,)."""
     return (aimed[:, ahead.knots :] != proposed[:, ahead.knots :]).any(axis=1)
 
 
