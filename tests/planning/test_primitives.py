@@ -130,7 +130,7 @@ def made_up(n):
         np.ones((n, 12)),
         np.zeros((n, 12, 6)),
     )
-    energy[:, 6], strain[:, 6], stretch[:, 6], loads[:, 6, 4] = 0.8, 0.012, 0.5, 2.4
+    energy[:, 6], strain[:, 6], stretch[:, 6], loads[:, 6, 4] = 0.8, 0.009, 0.55, 2.4
     deflection = np.tile(np.arange(12.0), (n, 1))
     values = {
         "energy": energy,
@@ -155,7 +155,7 @@ GUIDED = primitives((1, 0, 0, 0.1, 1, 0), (1, 0, 0, -0.2, -1, 0), (1, 0, 0, 0.05
 def test_cost_term_by_term_against_a_computation_by_hand():
     """The target is 8 mm deep, E₁ 0.5 mJ; x > 0 from the fifth step on: deflection 4 + 5 + … + 11 = 60.
 
-    Slopes of the guide's path are 0.1, −0.2 and 0.05. Strain, compression and force are 1.2, 1 and 1.2 of their limits.
+    Slopes of the guide's path are 0.1, −0.2 and 0.05. Strain, compression and force are 0.9, 0.9 and 1.2 of their limits.
     """
     found, d = terms(GUIDED), abs(1.5 + np.tan(0.2) * 0.5 - 2.0)
     assert found == {
@@ -164,8 +164,8 @@ def test_cost_term_by_term_against_a_computation_by_hand():
         "mean energy": pytest.approx(0.3 * (7 * 0.1 + 0.8) / 8 / 0.5),
         "peak energy": pytest.approx(0.4 * 0.8 / 0.5),
         "deflection": pytest.approx(0.16 * 60.0 / 8 / 8.0),
-        "limits": pytest.approx(100.0 * (1.2 / 0.8 - 1.0 + 1.0 / 0.8 - 1.0)),
-        "guide force": pytest.approx(100.0 * (1.2 / 0.8 - 1.0)),
+        "limits": pytest.approx(100.0 * 2.0 * (0.9 / 0.8 - 1.0) * 0.2 / 0.1),
+        "guide force": pytest.approx(100.0 * (1.2 / 0.8 - 1.0) * 0.2 / 0.002),
         "guide": pytest.approx(0.05 * 8.0 * (0.01 + 0.04 + 0.0025) / 3.0),
         "flips": pytest.approx(0.015 * 2),
     }
