@@ -244,7 +244,7 @@ def cost_terms(
     weights = per_energy(ADAPTIVE_MPC.weights(settings), memory.scale)
     whole = max(target[0], uncorrected)
     # A late roll costs no more energy than an early one, a late motion of the guide does.
-    share = 1.0 if ahead.step > 0.0 else min(1.0, max(ahead.left, uncorrected) / whole)
+    share = 1.0 if guided else min(1.0, max(ahead.left, uncorrected) / whole)
     weights["slope"] *= min(1.0, ahead.left / whole)
     weights["late"] *= fitted.roll_sd
     weights["guide force"] = weights["limits"] if math.isfinite(memory.loads.force) else 0.0
