@@ -103,16 +103,17 @@ def steps_to_planned_base(setup: Setup, plan: Plan, state: State, depth: Floats)
 
     A base that lags behind the plan moves as fast as its limits allow.
     """
-    limit = np.repeat([setup.max_base_step_mm, setup.max_base_turn_step], 2)
+    limits = np.repeat([setup.max_base_step_mm, setup.max_base_turn_step], 2).tolist()
     base = slice(DB_Y, DG_Y)
     moved = np.concatenate([np.zeros((1, 4)), np.cumsum(plan.controls[:, base], axis=0)])
-    goal = np.stack([np.interp(depth, plan.tips[:, X], column) for column in moved.T], axis=1)
-    goal[:, :2] = np.clip(goal[:, :2], -setup.max_base_travel_mm, setup.max_base_travel_mm)
-    steps, place = np.zeros_like(goal), state.travel[base]
-    for step, end in zip(steps, goal, strict=True):
-        step[:] = np.clip(end - place, -limit, limit)
-        place = place + step
-    return steps
+    goal = np.stack([np.interp(depth, plan.tips[:, X], column) for column in moved.T])
+    goal[:2] = np.clip(goal[:2], -setup.max_base_travel_mm, setup.max_base_travel_mm)
+    steps = []
+    for place, limit, ends in zip(state.travel[base].tolist(), limits, goal.tolist(), strict=True):
+        for end in ends:
+            steps.append(min(max(end - place, -limit), limit))
+            place += steps[-1]
+    return np.array(steps).reshape(goal.shape).T
 
 
 def _variables(

@@ -6,6 +6,7 @@ where it rolls to any angle. Sample 0 corrects nothing, so the path is only repl
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +134,7 @@ class Ahead:
         """Depth (mm) of a roll that is not made."""
         return float(self.depth[-1]) + 0.5 * self.left + self.advance
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
         """Bounds of a sample, (d,) each."""
         wide = 2.0 * self.setup.max_guide_travel_mm if self.step > 0.0 else 0.0
@@ -193,9 +194,10 @@ class Ahead:
 
     def _without_rolls(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
         """Return controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
-        rows = controls(len(depth), depth.shape[1] - 1, db_x=np.diff(depth, axis=1))
-        for axis, ones in enumerate(np.split(corrections, self.axes, axis=1)):
-            rows[:, :, DG_Y + axis] = np.diff(self._guide(ones, depth, axis), axis=1)
+        advance = np.diff(depth, axis=1)
+        rows = controls(*advance.shape, db_x=advance)
+        guide = self._guide(corrections.reshape(-1, self.axes, KNOTS.size), depth, advance)
+        rows[:, :, DG_Y : DG_Y + self.axes] = np.diff(guide, axis=0).swapaxes(0, 1)
         rows[:, :, DB_Y:DG_Y] = self.base
         return rows, depth
 
@@ -208,48 +210,49 @@ class Ahead:
         """
         n, m, half = len(rolls), self.depth.size - 1, self.setup.half_turns
         order = np.argsort(rolls, axis=1, kind="stable")
-        ascending = np.take_along_axis(rolls, order, axis=1)
-        goals = np.full_like(ascending, np.pi) if half else np.take_along_axis(angles, order, axis=1)
-        depth, turned = np.tile(self.depth, (n, 1)), np.zeros((n, m + 1))
-        middle = 0.5 * (self.depth[1:] + self.depth[:-1])
-        rows, last, angle = np.arange(n), np.full(n, -1), np.full(n, 0.0 if half else self.state.roll)
-        for roll, goal in zip(
-            _without_twins(ascending, _DUE * self.advance, both=half).T, goals.T, strict=True
-        ):
-            nearest = np.searchsorted(middle, roll)
-            turn = goal - angle if half else shorten_roll(self.setup, angle, goal - angle)
-            made = (roll < self.depth[-1]) & (nearest < m) & (np.abs(turn) >= LEAST_ROLL)
-            at = np.minimum(np.maximum(nearest, last + 1), m - 1)
-            inner = made & (at > 0)
-            depth[rows[inner], at[inner]] = roll[inner]
-            turned[rows[made], at[made]] += turn[made]
-            angle = angle if half else np.where(made, angle + turn, angle)
-            last = np.where(made, at, last)
-        roll = turned[:, :m]
+        ascending = _without_twins(rolls[np.arange(n)[:, None], order], _DUE * self.advance, both=half).T
+        nearest = np.searchsorted(0.5 * (self.depth[1:] + self.depth[:-1]), ascending)
+        made = (ascending < self.depth[-1]) & (nearest < m)
+        turns = np.full_like(ascending, np.pi)
+        if not half:
+            angle = np.full(n, self.state.roll)
+            for k, goal in enumerate(angles[np.arange(n)[:, None], order].T):
+                turns[k] = shorten_roll(self.setup, angle, goal - angle)
+                made[k] &= np.abs(turns[k]) >= LEAST_ROLL
+                angle = np.where(made[k], angle + turns[k], angle)
+        before = np.cumsum(made, axis=0) - made  # number of rolls at boundaries before
+        free = np.maximum.accumulate(np.where(made, nearest - before, -m), axis=0) + before
+        rolled, depth, roll = np.nonzero(made), np.tile(self.depth, (n, 1)), np.zeros((n, m))
+        place = rolled[1], np.minimum(free[rolled], m - 1)
+        depth[place] = np.where(place[1] > 0, ascending[rolled], self.depth[0])
+        np.add.at(roll, place, turns[rolled])
         if half:
             return depth, np.pi * (np.rint(roll / np.pi) % 2.0)
         # Rolls that share the last boundary are one, the short way.
         roll[:, -1] = shorten_roll(self.setup, self.state.roll + roll[:, :-1].sum(axis=1), roll[:, -1])
         return depth, roll
 
-    def _guide(self, corrections: Floats, depth: Floats, axis: int) -> Floats:
-        """Return guide positions (N, m + 1) on an axis within the limits, for corrections (N, k) at the knots."""
-        least, greatest = guide_reach(self.state.scenario, axis)
-        share = (depth - self.depth[0]) / max(self.left, 1e-9)
+    def _guide(self, corrections: Floats, depth: Floats, advance: Floats) -> Floats:
+        """Return guide positions (m + 1, N, axes) within the limits.
+
+        corrections (N, axes, k): at the knots; depth (N, m + 1), advance (N, m): before and in the steps.
+        """
+        limits = np.array([guide_reach(self.state.scenario, axis) for axis in range(self.axes)])
+        share = (depth.T - self.depth[0]) / max(self.left, 1e-9)
         knots = np.append(0.0, KNOTS)
-        padded = np.concatenate([np.zeros((len(corrections), 1)), corrections], axis=1)
-        at = np.clip(np.searchsorted(knots, share, side="right") - 1, 0, KNOTS.size - 1)
-        part = (share - knots[at]) / (knots[at + 1] - knots[at])
-        rows = np.arange(len(corrections))[:, None]
-        wanted = np.interp(depth, self.path.depth, self.path.guide[:, axis])
-        wanted += (1.0 - part) * padded[rows, at] + part * padded[rows, at + 1]
-        wanted = np.clip(wanted, least, greatest).T
-        most = (self.step * np.diff(depth, axis=1) / self.advance).T
-        guide = np.empty(wanted.shape)
-        guide[0] = self.state.guide[axis]
-        for k, step in enumerate(most):
-            guide[k + 1] = np.minimum(np.maximum(wanted[k + 1], guide[k] - step), guide[k] + step)
-        return guide.T
+        padded = np.concatenate([np.zeros((*corrections.shape[:2], 1)), corrections], axis=2)
+        at, row = np.searchsorted(KNOTS[:-1], share, side="right"), np.arange(len(corrections))
+        part = ((share - knots[at]) / (knots[at + 1] - knots[at]))[..., None]
+        paths = self.path.guide[:, : self.axes].T
+        wanted = np.stack([np.interp(depth.T, self.path.depth, path) for path in paths], axis=-1)
+        wanted += (1.0 - part) * padded[row, :, at] + part * padded[row, :, at + 1]
+        guide: Floats = np.minimum(np.maximum(wanted, limits[:, 0]), limits[:, 1])
+        guide[0] = self.state.guide[: self.axes]
+        most = (self.step * advance.T / self.advance)[..., None]
+        if ((guide[1:] < guide[:-1] - most) | (guide[1:] > guide[:-1] + most)).any():
+            for before, step, after in zip(guide[:-1], most, guide[1:], strict=True):
+                np.minimum(np.maximum(after, before - step), before + step, out=after)
+        return guide
 
     def correct(self, z: Floats) -> GuidePath:
         """Return the path with the corrections of a sample (d,)."""
