@@ -189,7 +189,11 @@ def from_row(row: Floats) -> NeedleState:
 
 def to_parts(laterals: Laterals, axes: int) -> Floats:
     """Return the parts (…, axes) of laterals (…)."""
-    return np.stack([laterals.real, laterals.imag][:axes], axis=-1)
+    parts = np.empty((*laterals.shape, axes))
+    parts[..., 0] = laterals.real
+    if axes > 1:
+        parts[..., 1] = laterals.imag
+    return parts
 
 
 def from_parts(parts: Floats) -> Laterals:

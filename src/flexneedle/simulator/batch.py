@@ -68,13 +68,10 @@ def _make_outputs(
     size: int, steps: int, nodes: int, across: int, kept: Mapping[str, int], ends: bool
 ) -> Outputs:
     """Return memory for the outputs of `size` sequences, of as many steps as are kept of each by name."""
+    last = size if ends else 0
 
     def column(name: str, *shape: int) -> Floats:
-        wanted = kept.get(name, 0)
-        return np.empty((size, wanted, *shape)) if wanted else np.empty((0, 0, *(0 for _ in shape)))
-
-    def at_end(*shape: int) -> Floats:
-        return np.empty((size, *shape) if ends else (0, *(0 for _ in shape)))
+        return np.empty((size, kept.get(name, 0), *shape))
 
     return Outputs(
         np.empty((size, steps, POSE_SIZE)),
@@ -85,9 +82,13 @@ def _make_outputs(
         column("loads", LOADS),
         column("strain"),
         column("shapes", nodes + 2, 1 + 2 * across),
-        Starts(at_end(row_size(across)), at_end(nodes, across), at_end(nodes, across)),
-        at_end(nodes, len(SOLUTION), across),
-        at_end(nodes + 1),
+        Starts(
+            np.empty((last, row_size(across))),
+            np.empty((last, nodes, across)),
+            np.empty((last, nodes, across)),
+        ),
+        np.empty((last, nodes, len(SOLUTION), across)),
+        np.empty((last, nodes + 1)),
     )
 
 

@@ -1,7 +1,6 @@
 """Sequences of controls as arrays of kernels, each with its state and its model, and their results."""
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +58,8 @@ def as_states(states: State | Sequence[State], count: int) -> list[State]:
     begun = list(states) if isinstance(states, Iterable) else [states]
     for state in begun:
         check_instance("state", state, State, "begin with simulator.start()")
+        if state.scenario is begun[0].scenario:
+            continue
         own, first = ((one.scenario.setup.axes, one.scenario.needle.nodes) for one in (state, begun[0]))
         if own != first:
             rule = f"must be the same for all states, here {first}"
@@ -72,8 +73,8 @@ def as_states(states: State | Sequence[State], count: int) -> list[State]:
 def check_model(name: str, model: Model, other: Model) -> None:
     """Raise InputError unless a model has the axes and the contact points of another."""
     check_instance(name, model, Model, "make one with simulator.adapt(adaptation)")
-    same = type(model.curvature) is type(other.curvature)
-    if not (same and np.array_equal(model.nodes["x"], other.nodes["x"])):
+    same = model.nodes is other.nodes or np.array_equal(model.nodes["x"], other.nodes["x"])
+    if not (same and type(model.curvature) is type(other.curvature)):
         axes = 2 if isinstance(model.curvature, complex) else 1
         rule = "must have the axes, guide and contact points of its state's scenario"
         raise make_refusal(name, f"{model.nodes.size} points on {axes} axes", rule)
@@ -130,16 +131,19 @@ def drive(states: Sequence[State], rows: Floats) -> Floats:
 
 def lines(states: Sequence[State], count: int, axes: ArrayLike | None = None) -> Floats:
     """Return the lines (count, 2, axes) from which a deflection counts (default: the axis of each needle's entry)."""
-    entries = [state.scenario.entry for state in (states[:1] if _common_scenario(states) else states)]
-    own = [[entry.lateral(0.0), entry.slope] for entry in entries]
+    across = states[0].scenario.setup.axes
+    if axes is None:
+        entries = [state.scenario.entry for state in (states[:1] if _common_scenario(states) else states)]
+        own = np.array([[entry.lateral(0.0), entry.slope] for entry in entries])
+        return np.repeat(to_parts(own, across), count // len(own), axis=0)
     try:
-        given = np.array(own if axes is None else axes, dtype=complex)
+        given = np.array(axes, dtype=complex)
         found = np.broadcast_to(given, (count, 2))
     except (TypeError, ValueError):
         raise make_refusal("axes", axes, f"must be numbers ({count}, 2)") from None
     if not np.isfinite(given).all():
         raise make_refusal("axes", axes, "must be finite")
-    return np.ascontiguousarray(to_parts(found, states[0].scenario.setup.axes))
+    return np.ascontiguousarray(to_parts(found, across))
 
 
 def _common_scenario(states: Sequence[State]) -> Scenario | None:
@@ -174,7 +178,7 @@ def trajectories(
 
 def end(state: State, model: Model, rows: Floats, out: Outputs, number: int) -> State:
     """Return the state after controls (m, 9), from the outputs of a rollout."""
-    return replace(state, model=model, roll=_turn(state, rows), solved=Solved.of(model, out, number))
+    return State(state.scenario, model, state.clamp, _turn(state, rows), Solved.of(model, out, number))
 
 
 def _turn(state: State, rows: Floats) -> float:

@@ -229,13 +229,14 @@ class State:
         )
         load = across(boundary.load, tip_load)
         needle = self.needle._replace(boundary=boundary._replace(base=pose, load=load))
-        return replace(self, solved=self.solved.with_needle(needle), clamp=moved)
+        return State(self.scenario, self.model, moved, self.roll, self.solved.with_needle(needle))
 
     def discount_advance(self, extra: float) -> "State":
         """Return the state with this part (mm) of the base's advance counted as an error, which is no travel."""
         clamp, offset = self.clamp, self.scenario.entry.slope * extra
         across = lateral(clamp.y, clamp.y.real + offset.real, clamp.y.imag + offset.imag)
-        return replace(self, clamp=nd.NodePose(clamp.x + extra, across, clamp.slope))
+        moved = nd.NodePose(clamp.x + extra, across, clamp.slope)
+        return State(self.scenario, self.model, moved, self.roll, self.solved)
 
     def _curve(self) -> tuple[Floats, Laterals, Laterals]:
         """Return x, y and slope of base, nodes and tip."""
