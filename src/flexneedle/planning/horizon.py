@@ -49,10 +49,16 @@ class Found:
 
     z: Floats  # the best sample (d,)
     cost: float
-    terms: dict[str, float]  # the cost's weighted terms by name
+    charged: Sequence[Term]  # the terms of the cost
     trajectories: Trajectories  # its rollout (N = 1)
     search_state: ce.SearchState
     samples: Samples  # samples of the last iteration
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """The cost's weighted terms by name."""
+        weighted = evaluate_terms(self.charged, self.trajectories)
+        return {name: float(value[0]) for name, value in weighted.items()}
 
 
 def find_best(
@@ -99,8 +105,7 @@ def find_best(
     opening = np.clip(opening, settings.lower, settings.upper)
     search_state = ce.minimize(evaluate, search_state, settings, rng, show, opening)
     found = rollout(variables.controls(search_state.best[None])) if best is None else best
-    charged = {name: float(value[0]) for name, value in evaluate_terms(terms, found).items()}
-    return Found(search_state.best, search_state.best_cost, charged, found, search_state, latest[0])
+    return Found(search_state.best, search_state.best_cost, terms, found, search_state, latest[0])
 
 
 def count_iterations(progress: OnIteration, before: int, usual: int, least: float) -> OnIteration:
