@@ -14,18 +14,12 @@ from flexneedle.estimation.move_means import MoveMeans
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.prior import Prior, Priors, Slots
 from flexneedle.estimation.sensors import Sensor, sensors_of
-from flexneedle.mechanics.model import Adaptation, Model, adapt
+from flexneedle.mechanics.model import Adaptation, Model, adapt, adapt_needle
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import DB_X, STILL, THETA, Floats, Laterals, X, Y, Z, laterals
 
 _REST = np.array([STILL])
-_OF_MOVES = (
-    "slots",
-    "rows",
-    "sensors",
-    "readings",
-)  # depend on scenario and moves, the last also on the bevel
 # An offset that turns with the bevel: error of its mean in a roll, whose motor starts and stops, relative to it.
 _UNEVEN = 0.2
 
@@ -84,7 +78,7 @@ class FittedInsertion:
     @cached_property
     def rows(self) -> Floats:
         """The commands of the moves (m, 9)."""
-        return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, len(STILL))
+        return np.array([done.motion.control for done in self.moves], dtype=float).reshape(-1, len(STILL))
 
     @cached_property
     def moves_on(self) -> NDArray[np.bool_]:
@@ -92,7 +86,7 @@ class FittedInsertion:
         moves_on: NDArray[np.bool_] = (self.rows[:, DB_X] > 0.0) | (self.tips[1:, X] <= 0.0)
         return moves_on
 
-    @property
+    @cached_property
     def lead(self) -> Floats:
         """Axial distance (m,), mm, in each move from the model's tip, which is at rest, to the measured one."""
         lead: Floats = np.where(self.moves_on, self.play, 0.0)
@@ -153,11 +147,20 @@ class FittedInsertion:
         slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
         return slopes
 
+    @cached_property
+    def covariance(self) -> Floats:
+        """Posterior covariance (K, K) of the parameters."""
+        inverse: Floats = np.linalg.inv(self.precision).astype(np.float64)
+        return inverse
+
     def change(self, **changes: Any) -> Self:
-        """Return the insertion with changes, but the same moves: properties of these are kept."""
-        made = replace(self, **changes)
-        kept = _OF_MOVES if made.state.bevel == self.state.bevel else _OF_MOVES[:-1]
-        vars(made).update({name: value for name, value in vars(self).items() if name in kept})
+        """Return the insertion with changes; properties of what has not changed are kept."""
+        made, kept = replace(self, **changes), ["slots", "sensors"]
+        if made.precision is self.precision:
+            kept.append("covariance")
+        if made.moves is self.moves:
+            kept += ["rows", "readings"] if made.state.bevel == self.state.bevel else ["rows"]
+        vars(made).update({name: vars(self)[name] for name in kept if name in vars(self)})
         return made
 
     def simulate_with(self, parameters: Floats) -> Self:
@@ -227,12 +230,6 @@ def adapt_models(nominal: Simulator, slots: Slots, cell: float, parameters: Sequ
                 variation=np.exp(each[variation:]),
             )
             tissues[key] = adapt(nominal.model, tissue)
-        needle = Adaptation(
-            shift=np.zeros(layers - 1),
-            stiffness=np.ones(layers),
-            bevel=float(each[slots.bevel]),
-            bend=from_components(each[slots.bend]),
-            clearance=float(each[slots.clearance]),
-        )
-        models.append(adapt(tissues[key], needle))
+        needle = float(each[slots.bevel]), from_components(each[slots.bend]), float(each[slots.clearance])
+        models.append(adapt_needle(tissues[key], *needle))
     return models

@@ -16,7 +16,6 @@ and added as a constant.
 import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import takewhile
 
 import numpy as np
@@ -126,18 +125,18 @@ class Identified(FittedInsertion):
         """Move the estimated needle as the driver did."""
         rested = self.moves and self.moves[-1].applied == STILL
         if motion.control == STILL and rested:  # one move, however long
-            return replace(self, moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)), perturbed=())
+            return self.change(moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)), perturbed=())
         new = Move.parts_of(motion)
         rows = np.array([done.applied for done in new])
         state, tips = replay_scaled(self.simulator, self.state, rows, self.axial_scale)
         tips = np.concatenate([self.tips, tips])
-        return replace(self, state=state, tips=tips, moves=(*self.moves, *new), perturbed=())
+        return self.change(state=state, tips=tips, moves=(*self.moves, *new), perturbed=())
 
     def observe(self, measurements: Sequence[Measurement]) -> "Identified":
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
         if not measurements or not self.moves:
             return self.without_reading()
-        extended = replace(self, moves=assign_readings(self.moves, measurements))._fit_axially()
+        extended = self.change(moves=assign_readings(self.moves, measurements))._fit_axially()
         readings = extended.readings[0]
         fitted = improve_fit(extended)
         left, lead = fitted.residuals[0], fitted.lead
@@ -173,12 +172,6 @@ class Identified(FittedInsertion):
             axial_covariance=covariance,
             even_advance=fit_even_advance(without, columns, variance, prior),
         )
-
-    @cached_property
-    def covariance(self) -> Floats:
-        """Posterior covariance (K, K) of the parameters."""
-        inverse: Floats = np.linalg.inv(self.precision).astype(np.float64)
-        return inverse
 
     @property
     def tip_sd(self) -> float:

@@ -36,7 +36,8 @@ class MoveMeans:
         part, x, y, z, facing_y, facing_z, count, reported, ahead = (
             np.array([*found.values()]).reshape(-1, 9).T
         )
-        turned = np.cumsum([done.applied.roll + done.applied.spin for done in moves])
+        commands = [done.motion.control for done in moves]
+        turned = np.cumsum([command.roll + command.spin for command in commands])
         after = bevel * np.exp(1j * (turned - turned[-1]))[kept]
         turns = np.array([moves[k].is_roll for k in kept], dtype=bool)
         if axes == 1:

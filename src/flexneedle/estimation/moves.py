@@ -1,16 +1,13 @@
 """The moves of an insertion, and the readings taken during each."""
 
 import cmath
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import nan
 from statistics import fmean
 from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.estimation.sensors import SENSORS, Sensor
 from flexneedle.types import STILL, Control, Floats, Measurement, Motion, Point, Pose
@@ -129,13 +126,10 @@ def assign_readings(moves: tuple[Move, ...], measurements: Sequence[Measurement]
 
     Between moves the tip rests.
     """
-    owner = _owners(moves, measurements)
-    return tuple(
-        done.with_readings(new)
-        if (new := tuple(one for one, k in zip(measurements, owner, strict=True) if k == j))
-        else done
-        for j, done in enumerate(moves)
-    )
+    given: dict[int, list[Measurement]] = {}
+    for one, k in zip(measurements, _owners(moves, measurements), strict=True):
+        given.setdefault(k, []).append(one)
+    return tuple(done.with_readings(tuple(given[k])) if k in given else done for k, done in enumerate(moves))
 
 
 def drop_roll_readings(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> list[Measurement]:
@@ -150,11 +144,10 @@ def drop_roll_readings(moves: tuple[Move, ...], measurements: Sequence[Measureme
     ]
 
 
-def _owners(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> NDArray[np.intp]:
+def _owners(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> list[int]:
     """Return the number of the last move that had begun before each measurement, 0 for earlier ones."""
-    starts = np.array([done.motion.begun for done in moves[1:]])
-    owners: NDArray[np.intp] = np.searchsorted(starts, [one.time - _ROUNDING_S for one in measurements])
-    return owners
+    starts = [done.motion.begun for done in moves[1:]]
+    return [bisect_left(starts, one.time - _ROUNDING_S) for one in measurements]
 
 
 def position_along(moves: tuple[Move, ...], tips: Floats, time: float, lead: Floats | None = None) -> Point:

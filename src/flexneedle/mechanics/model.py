@@ -173,12 +173,17 @@ def adapt(model: Model, adaptation: Adaptation) -> Model:
         and (adaptation.variation == 1.0).all()
     )
     tissue = model if same else _adapt_tissue(model, adaptation)
-    return tissue._replace(
-        bevel_offset=model.bevel_offset * adaptation.bevel,
+    return adapt_needle(tissue, adaptation.bevel, adaptation.bend, adaptation.clearance)
+
+
+def adapt_needle(model: Model, bevel: float, bend: Any, clearance: float) -> Model:
+    """Return the model with another needle; arguments as of `Adaptation`."""
+    return model._replace(
+        bevel_offset=model.bevel_offset * bevel,
         # Of one type with and without an adaptation, so that kernels are compiled once.
-        curvature=type(model.curvature)(2.0 * adaptation.bend / model.length**2),
+        curvature=type(model.curvature)(2.0 * bend / model.length**2),
         # Below the tolerance of the solve the side that the needle bears on would be rounding.
-        clearance=adaptation.clearance if adaptation.clearance > model.slide else 0.0,
+        clearance=clearance if clearance > model.slide else 0.0,
     )
 
 
@@ -208,12 +213,10 @@ def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
     tops = np.append(0.0, bottoms)
     before = np.append(0.0, np.cumsum(density[:-1] * np.diff(tops)))
 
-    def up_to(x: Floats) -> Floats:
-        inside = bottoms.searchsorted(x, side="right")
-        total: Floats = before[inside] + density[inside] * (x - tops[inside])
-        return total
-
-    return up_to(nodes["x"] + nodes["reach"]) - up_to(nodes["x"] - nodes["reach"])
+    ends = nodes["x"] + np.multiply.outer((-1.0, 1.0), nodes["reach"])
+    inside = bottoms.searchsorted(ends, side="right")
+    first, last = before[inside] + density[inside] * (ends - tops[inside])
+    return last - first
 
 
 # ---- models as arrays of numbers, for kernels
@@ -228,14 +231,20 @@ def pack(models: Sequence[Model]) -> Models:
             first[id(one.laws)] = rows
             laws.append(one.laws.reshape(-1, one.laws.shape[-1]))
             rows += len(laws[-1])
-    apart = {(id(one.nodes), id(one.laws)): one for one in models}
-    nodes = {key: _node_columns(one, n, first[key[1]]) for key, one in apart.items()}
+    apart = {(id(one.nodes), id(one.layers), id(one.laws)): one for one in models}
+    tissues = {
+        key: (_node_columns(one, n, first[key[2]]), _layer_columns(one, depth, first[key[2]]))
+        for key, one in apart.items()
+    }
+    nodes, layers = zip(
+        *(tissues[id(one.nodes), id(one.layers), id(one.laws)] for one in models), strict=True
+    )
     axes = 2 if isinstance(models[0].curvature, complex) else 1
     return Models(
         np.array([_constants(one) for one in models]),
         to_parts(np.array([one.curvature for one in models]), axes),
-        np.array([nodes[id(one.nodes), id(one.laws)] for one in models]),
-        np.array([_layer_columns(one, depth, first[id(one.laws)]) for one in models]),
+        np.array(nodes),
+        np.array(layers),
         np.concatenate(laws) if len(laws) > 1 else laws[0],
     )
 
