@@ -1,7 +1,7 @@
 """The insertion simulated with fitted parameters, and its readings."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -155,7 +155,8 @@ class FittedInsertion:
 
     def change(self, **changes: Any) -> Self:
         """Return the insertion with changes; properties of what has not changed are kept."""
-        made, kept = replace(self, **changes), ["slots", "sensors"]
+        fields = {name: vars(self)[name] for name in self.__dataclass_fields__}
+        made, kept = type(self)(**{**fields, **changes}), ["slots", "sensors"]
         if made.precision is self.precision:
             kept.append("covariance")
         if made.moves is self.moves:

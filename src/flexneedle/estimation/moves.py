@@ -159,7 +159,7 @@ def position_along(moves: tuple[Move, ...], tips: Floats, time: float, lead: Flo
     if last < 0:
         return Pose.of(tips[0]).point
     part = moves[last].part(time)
-    x, y, z = Pose.of((1.0 - part) * tips[last] + part * tips[last + 1]).point
+    x, y, z, *_ = ((1.0 - part) * tips[last] + part * tips[last + 1]).tolist()
     return x + (0.0 if lead is None else float(lead[last])), y, z
 
 

@@ -286,7 +286,8 @@ class Simulator:
         tip = None if held is None else nd.to_parts(np.array([held]), axes)
         rows, starts = np.zeros((1, 0, len(COLUMNS))), pack_states([state], merged.nodes.size)
         out = run(packed, none, starts, none, rows, lines([state], 1), 1, ends=True, held=tip)
-        return replace(state, model=self._model, solved=Solved.of(merged, out, 0))
+        solved = Solved.of(merged, out, 0).without_points(merged.nodes)
+        return replace(state, model=self._model, solved=solved)
 
     def _check_mechanics(self, state: State) -> None:
         if state.scenario is self.scenario:

@@ -313,14 +313,12 @@ class Solved:
 
     @staticmethod
     def of(model: Model, out: Outputs, number: int) -> "Solved":
-        """Return a needle from the outputs of a rollout of `model`, which may have measured points."""
+        """Return a needle from the outputs of a rollout of `model`."""
         ends, nodes = out.ends, model.nodes
         row = ends.needles[number]
         behind = int(row[nd.BEHIND])
         stored = np.concatenate([out.stored[number, :behind], out.stored[number, -1:]])
         rest, compression = ends.rest[number, : nodes.size], ends.compression[number, : nodes.size]
-        if (measured := nodes["kind"] == ESSENTIAL).any():
-            rest, compression = rest[~measured], compression[~measured]
         solution = out.solution[number, :behind]
         arrays = row, rest, compression, nodes["x"][:behind], nodes["weight"][:behind], solution, stored
         return Solved(*(_freeze(array.copy()) for array in arrays))
@@ -332,6 +330,11 @@ class Solved:
         return Solved(
             nd.to_row(needle, axes), none, none, none[:0, 0], none[:0, 0], np.zeros((0, 5, axes)), np.zeros(1)
         )
+
+    def without_points(self, nodes: NDArray[Any]) -> "Solved":
+        """Return the same without contacts at the measured points among `nodes` (k,)."""
+        kept = nodes["kind"] != ESSENTIAL
+        return replace(self, rest=_freeze(self.rest[kept]), compression=_freeze(self.compression[kept]))
 
     def with_needle(self, needle: nd.NeedleState) -> "Solved":
         """Return the same with other numbers of the needle, for the next solve."""

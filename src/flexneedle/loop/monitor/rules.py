@@ -44,12 +44,13 @@ def check_missing(measurement: Measurement, axes: int = 1) -> Verdict:
 
 def check_not_a_number(measurement: Measurement) -> Verdict:
     """Require finite time, coordinates, direction, points and covariances; the verdict names the others."""
-    bad = [
-        f"{name} {wrong[0]}"
-        for name, values in _list_numbers(measurement)
-        if (wrong := [value for value in values if value is not None and not math.isfinite(value)])
-    ]
-    return Verdict(VerdictKind.NOT_A_NUMBER, ", ".join(bad)) if bad else OK
+    bad: dict[str, float] = {}  # the first of each name
+    for name, values in _list_numbers(measurement):
+        for value in values:
+            if value is not None and not math.isfinite(value):
+                bad.setdefault(name, value)
+    reason = ", ".join(f"{name} {value}" for name, value in bad.items())
+    return Verdict(VerdictKind.NOT_A_NUMBER, reason) if bad else OK
 
 
 def check_stale(time: float, now: float, limit: float) -> Verdict:
