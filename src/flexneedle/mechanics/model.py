@@ -196,23 +196,23 @@ def _adapt_tissue(model: Model, adaptation: Adaptation) -> Model:
     ends = np.maximum.accumulate(np.maximum(0.0, old["end"][:-1] + adaptation.shift))
     cells = adaptation.cell * np.arange(1, adaptation.variation.size)
     bottoms = np.sort(np.concatenate([ends, cells]))
-    tops = np.append(-np.inf, bottoms)
-    layers = old[ends.searchsorted(tops, side="right")]
-    factor = adaptation.stiffness[ends.searchsorted(tops, side="right")]
-    layers["stiffness"] *= factor * adaptation.variation[cells.searchsorted(tops, side="right")]
-    layers["end"] = np.append(bottoms, np.inf)
+    tops = np.concatenate([[-np.inf], bottoms])
+    layer = ends.searchsorted(tops, side="right")
+    layers = old[layer]
+    variation = adaptation.variation[cells.searchsorted(tops, side="right")]
+    layers["stiffness"] *= adaptation.stiffness[layer] * variation
+    layers["end"][:-1], layers["end"][-1] = bottoms, np.inf
     at, contact = old[ends.searchsorted(nodes["x"], side="right")], nodes["kind"] == CONTACT
-    changed = nodes.copy()
-    changed["stiffness"][contact] = _integral(bottoms, layers["stiffness"], nodes)[contact]
-    changed["height"][contact], changed["law"][contact] = at["height"][contact], at["law"][contact]
+    changed, stiffness = nodes.copy(), _integral(bottoms, layers["stiffness"], nodes)
+    for name, values in (("stiffness", stiffness), ("height", at["height"]), ("law", at["law"])):
+        changed[name] = np.where(contact, values, nodes[name])
     return model._replace(nodes=changed, layers=layers)
 
 
 def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
     """Return the integral (n,) along the intervals of the contact points of a density (l,), constant in each layer."""
-    tops = np.append(0.0, bottoms)
-    before = np.append(0.0, np.cumsum(density[:-1] * np.diff(tops)))
-
+    tops = np.concatenate([[0.0], bottoms])
+    before = np.concatenate([[0.0], np.cumsum(density[:-1] * (bottoms - tops[:-1]))])
     ends = nodes["x"] + np.multiply.outer((-1.0, 1.0), nodes["reach"])
     inside = bottoms.searchsorted(ends, side="right")
     first, last = before[inside] + density[inside] * (ends - tops[inside])
