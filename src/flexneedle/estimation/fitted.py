@@ -201,10 +201,11 @@ class FittedInsertion:
     def _place_start(self, parameters: Floats) -> State:
         """Return the start with these parameters (K,), not settled."""
         base, slope = components(parameters[self.slots.base]), components(parameters[self.slots.slope])
+        pose = self.start.base
         return self.start.with_estimate(
-            base_x=float(self.start.base[0]) + self.axial,
-            base=(self.start.base[Y : Z + 1] + base).tolist(),
-            slope=(self.start.base[THETA:] + slope).tolist(),
+            base_x=float(pose[X]) + self.axial,
+            base=(pose[Y : Z + 1] + base).tolist(),
+            slope=(pose[THETA:] + slope).tolist(),
         )
 
 

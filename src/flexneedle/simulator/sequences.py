@@ -73,7 +73,8 @@ def as_states(states: State | Sequence[State], count: int) -> list[State]:
 def check_model(name: str, model: Model, other: Model) -> None:
     """Raise InputError unless a model has the axes and the contact points of another."""
     check_instance(name, model, Model, "make one with simulator.adapt(adaptation)")
-    same = model.nodes is other.nodes or np.array_equal(model.nodes["x"], other.nodes["x"])
+    nodes, others = model.nodes, other.nodes
+    same = nodes is others or (nodes.size == others.size and (nodes["x"] == others["x"]).all())
     if not (same and type(model.curvature) is type(other.curvature)):
         axes = 2 if isinstance(model.curvature, complex) else 1
         rule = "must have the axes, guide and contact points of its state's scenario"

@@ -122,10 +122,13 @@ class Simulator:
 
     def _carry_out(self, state: State, rows: Floats) -> tuple[State, Floats]:
         none, starts = np.zeros(1, dtype=np.int64), pack_states([state], self._model.nodes.size)
-        out = run(
-            self._packed, none, starts, none, drive([state], rows[None]), lines([state], 1), 1, ends=True
-        )
+        out = run(self._packed, none, starts, none, drive([state], rows[None]), self._no_lines, 1, ends=True)
         return end(state, self._model, rows, out, 0), out.tips[0]
+
+    @property
+    def _no_lines(self) -> Floats:
+        """Lines (1, 2, axes) of a rollout without deflections."""
+        return np.zeros((1, 2, self.scenario.setup.axes))
 
     @property
     def model(self) -> Model:
@@ -285,7 +288,7 @@ class Simulator:
         none, axes = np.zeros(1, dtype=np.int64), self.scenario.setup.axes
         tip = None if held is None else nd.to_parts(np.array([held]), axes)
         rows, starts = np.zeros((1, 0, len(COLUMNS))), pack_states([state], merged.nodes.size)
-        out = run(packed, none, starts, none, rows, lines([state], 1), 1, ends=True, held=tip)
+        out = run(packed, none, starts, none, rows, self._no_lines, 1, ends=True, held=tip)
         solved = Solved.of(merged, out, 0).without_points(merged.nodes)
         return replace(state, model=self._model, solved=solved)
 
