@@ -36,6 +36,11 @@ def decided(plan, estimate, seed=0, path=None):
     return ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(seed))
 
 
+def corrected(ahead, z):
+    """The current path with the corrections of a sample (d,)."""
+    return ahead.path_of(ahead.controls(z[None])[0][0])
+
+
 def rolls_at(*depths):
     """Rolls (k, 2) of a path, by half a turn at each of these depths (mm)."""
     return np.column_stack([np.array(depths, dtype=float), np.pi * np.arange(1, len(depths) + 1)])

@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from adaptive import rolls_at
+from adaptive import corrected, rolls_at
 from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, path_of_plan, propose_samples
 from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
@@ -107,7 +107,7 @@ def test_the_path_found_is_the_current_path_of_the_next_period(quick_plan, along
     state = along(quick_plan, 30)
     ahead = ahead_of(quick_plan, state)
     for z in propose_samples(ahead, 48, np.random.default_rng(2)):
-        after = ahead_of(quick_plan, state, ahead.correct(z))
+        after = ahead_of(quick_plan, state, corrected(ahead, z))
         np.testing.assert_allclose(
             after.controls(after.current[None])[0][:, :, [DB_X, DG_Y, DG_Z]].sum(axis=1),
             ahead.controls(z[None])[0][:, :, [DB_X, DG_Y, DG_Z]].sum(axis=1), atol=1e-9,
@@ -140,7 +140,7 @@ def test_two_rolls_at_one_place_cancel(quick_plan):
     """Rolls before and after them stay."""
     for rolls, left in [((20.0, 20.0), []), ((10.0, 20.0, 20.0, 30.0), [10.0, 30.0]), ((20.0,) * 3, [20.0])]:
         ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
-        assert depths(ahead.correct(ahead.current)) == left
+        assert depths(corrected(ahead, ahead.current)) == left
 
 
 @given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
@@ -153,8 +153,8 @@ def test_rolls_near_each_other_are_all_made(quick_plan, rolls):
     depth = ahead.controls(ahead.current[None])[1]
     assert (np.diff(depth) >= 0.0).all()
     assert depth[0, -1] == ahead.depth[-1]
-    assert depths(ahead.correct(ahead.current)) == pytest.approx(rolls, abs=0.5)
-    assert depths(ahead.correct(ahead.current))[1:] == rolls[1:]
+    assert depths(corrected(ahead, ahead.current)) == pytest.approx(rolls, abs=0.5)
+    assert depths(corrected(ahead, ahead.current))[1:] == rolls[1:]
 
 
 def test_a_guide_that_may_not_move_is_not_moved(quick_plan):

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from adaptive import corrected
 from flexneedle.control.path import KNOTS, Ahead, GuidePath, propose_samples
 from flexneedle.scenario.files import load_scenario
 from flexneedle.simulator.control import Limits, controls
@@ -84,7 +85,7 @@ def test_the_first_sample_is_the_current_path(rig):
     ahead, scenario = ahead_of(rig)
     first = propose_samples(ahead, 24, np.random.default_rng(0))[0]
     np.testing.assert_array_equal(first, ahead.current)
-    path = ahead.correct(first)
+    path = corrected(ahead, first)
     for axis in range(2):
         planned = np.interp(path.depth, ahead.path.depth, ahead.path.guide[:, axis])
         np.testing.assert_allclose(path.guide[:, axis], planned, atol=1e-12)
@@ -98,7 +99,7 @@ def test_a_knot_moves_the_guide_on_its_own_axis():
     ahead, _ = ahead_of("two axes")
     z = ahead.current
     z[2 * KNOTS.size - 1] += 0.1
-    before, after = ahead.correct(ahead.current), ahead.correct(z)
+    before, after = corrected(ahead, ahead.current), corrected(ahead, z)
     np.testing.assert_allclose(after.guide[:, 0], before.guide[:, 0], atol=1e-12)
     share = (after.depth - after.depth[0]) / ahead.left
     wanted = 0.1 * np.interp(share, [KNOTS[-2], KNOTS[-1]], [0.0, 1.0])
@@ -135,7 +136,7 @@ def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
     order = rng.permutation(4)
     z[ahead.depths], z[ahead.angles] = depths[order], angles[order]
     rows, depth = ahead.controls(z[None])
-    np.testing.assert_allclose(ahead.correct(z).rolls, np.stack([depths, angles], axis=1), atol=1e-9)
+    np.testing.assert_allclose(corrected(ahead, z).rolls, np.stack([depths, angles], axis=1), atol=1e-9)
     middle, angle = 0.5 * (depth[0, 1:] + depth[0, :-1]), angles_of(ahead, rows)[0]
     behind = np.searchsorted(depths, middle)
     np.testing.assert_allclose(angle, np.append(ahead.state.roll, angles)[behind], atol=1e-9)
@@ -165,7 +166,7 @@ def test_of_two_rolls_at_one_depth_the_second_counts():
     at = float(ahead.depth[5]) + 0.2
     z[ahead.depths.start : ahead.depths.start + 2] = at, at + 1e-3
     z[ahead.angles.start : ahead.angles.start + 2] = 1.0, -2.0
-    np.testing.assert_allclose(ahead.correct(z).rolls, [[at + 1e-3, -2.0]])
+    np.testing.assert_allclose(corrected(ahead, z).rolls, [[at + 1e-3, -2.0]])
 
 
 @pytest.mark.parametrize("rig", ["two axes", "no guide"])

@@ -155,7 +155,7 @@ GUIDED = primitives((1, 0, 0, 0.1, 1, 0), (1, 0, 0, -0.2, -1, 0), (1, 0, 0, 0.05
 def test_cost_term_by_term_against_a_computation_by_hand():
     """The target is 8 mm deep, E₁ 0.5 mJ; x > 0 from the fifth step on: deflection 4 + 5 + … + 11 = 60.
 
-    Slopes of the guide's path are 0.1, −0.2 and 0.05. Strain, compression and force are 0.9, 0.9 and 1.2 of their limits.
+    Slopes of the guide's path are 0.1, −0.2 and 0.05. Strain and compression are 0.9 of their limits, the force 1.2.
     """
     found, d = terms(GUIDED), abs(1.5 + np.tan(0.2) * 0.5 - 2.0)
     assert found == {

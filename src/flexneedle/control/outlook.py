@@ -91,18 +91,18 @@ class Outlook:
     def sd_to_come(self, estimate: Identified, target: float) -> float:
         """Return the standard deviation (mm), on an axis, of the miss after all corrections, by the linear model."""
         step = estimate.nominal.scenario.setup.max_advance_mm
-        known = self.sd_after(estimate, target, target - UNCORRECTED * step) ** 2
+        known = float(self.sd_after(estimate, target, np.array([target - UNCORRECTED * step]))[0]) ** 2
         known += _UNEXPLAINED**2 * estimate.reading_variance
         known += (_DRIFT * (target - float(estimate.state.tip[X]))) ** 2
         return float(np.sqrt(known))
 
-    def sd_after(self, estimate: Identified, target: float, depth: float) -> float:
-        """Return the standard deviation (mm), on an axis, of the end if uncorrected, after readings down to `depth`."""
-        end = self.at(target)
-        to_come = (self.grid > estimate.state.tip[X]) & (self.grid <= depth)
-        slopes = self.curves[:, to_come]
-        then = estimate.precision + (slopes @ slopes.conj().T).real / estimate.reading_variance
-        return float(np.sqrt((end.conj() @ np.linalg.solve(then, end)).real / estimate.axes))
+    def sd_after(self, estimate: Identified, target: float, depths: Floats) -> Floats:
+        """Return standard deviations (d,), mm, on an axis, of the end if uncorrected, after readings down to depths."""
+        end, to_come = self.at(target), self.grid > estimate.state.tip[X]
+        slopes = np.where((to_come & (self.grid <= depths[:, None]))[:, None], self.curves, 0.0)
+        then = estimate.precision + (slopes @ slopes.conj().swapaxes(1, 2)).real / estimate.reading_variance
+        sd: Floats = np.sqrt((np.linalg.solve(then, end[:, None])[..., 0] @ end.conj()).real / estimate.axes)
+        return sd
 
     def shape_sd(self, estimate: Identified, target: float, lever: Laterals, miss_sd: float) -> Floats:
         """Return the standard deviations (n, 2) of y and z of the nodes at the target (mm).

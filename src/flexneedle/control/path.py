@@ -20,7 +20,7 @@ from flexneedle.results import Plan
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, Laterals, X
+from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Control, Floats, Laterals, X
 
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""
@@ -254,14 +254,14 @@ class Ahead:
                 np.minimum(np.maximum(after, before - step), before + step, out=after)
         return guide
 
-    def correct(self, z: Floats) -> GuidePath:
-        """Return the path with the corrections of a sample (d,)."""
-        rows, depth = self.controls(z[None])
-        moved = np.cumsum(rows[0, :, DG_Y : DG_Y + 2], axis=0)
-        guide = np.array(self.state.guide) + np.concatenate([np.zeros((1, 2)), moved])
-        angle = self.state.roll + np.cumsum(rows[0, :, ROLL])
-        rolls = np.stack([depth[0, :-1], angle], axis=1)[rows[0, :, ROLL] != 0.0]
-        return GuidePath(depth[0], guide, rolls)
+    def path_of(self, rows: Floats) -> GuidePath:
+        """Return the path of controls (m, 9) from the tip to the target."""
+        depth = self.depth[0] + np.append(0.0, np.cumsum(rows[:, DB_X]))
+        guide = np.zeros((depth.size, 2))
+        np.cumsum(rows[:, DG_Y : DG_Y + 2], axis=0, out=guide[1:])
+        turned = rows[:, ROLL]
+        rolls = np.stack([depth[:-1], self.state.roll + np.cumsum(turned)], axis=1)[turned != 0.0]
+        return GuidePath(depth, guide + self.state.guide, rolls)
 
     def first_command(self, path: GuidePath) -> tuple[Control, GuidePath]:
         """Return the command of this period, and the rest of a path after it.

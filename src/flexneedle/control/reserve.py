@@ -77,5 +77,5 @@ def reserve_of_bevel(
     *before, lost = np.clip([lever.lost_from(k * least) for k in levers], *ahead.depth[[0, -1]]).tolist()
     begins = np.array([*before, *(lost + share * (ahead.depth[-1] - lost) for share in _SHARES)])
     prices = np.append(1.0 / np.array(_LEVERS), np.ones(len(_SHARES)))
-    sds = margin * np.array([outlook.sd_after(estimate, target[0], depth) for depth in begins])
+    sds = margin * outlook.sd_after(estimate, target[0], begins)
     return Reserve(begins, sds, prices, abs(bend), not ahead.setup.half_turns)

@@ -140,11 +140,11 @@ def decide(
     lost = probability_beyond(task.scenario.control.miss_limit_mm, forecast.miss, forecast.sd) > _LOST
     if lost or (begins and ahead.step):
         memory = replace(memory, outlook=forecast.outlook, lever=forecast.lever)
-        ahead = Ahead.of(task, fitted.state, ahead.correct(found.z))
+        ahead = Ahead.of(task, fitted.state, ahead.path_of(found.trajectories.controls[0]))
         found = search_path(task, fitted, ahead, memory, settings.effort, rng)
         forecast = _forecast(task, memory, fitted, ahead, found)
     outlook, lever, miss, sd, predicted = forecast
-    path = ahead.correct(found.z)
+    path = ahead.path_of(found.trajectories.controls[0])
     command, rolled = ahead.first_command(path)
     rest, rests = _rest_time(task, memory, fitted, ahead.left)
     why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
