@@ -155,10 +155,13 @@ class Ahead:
         angles = rolls[:0, 1] if self.setup.half_turns else rolls[:, 1]
         return np.concatenate([np.zeros(self.knots), rolls[:, 0], angles])
 
-    def lean_guide(self, z: Floats) -> Floats:
-        """Return samples (k, d): in each the guide is `LEAN` further in +y at one of the knots, if it may move."""
-        others = np.tile(z, (KNOTS.size, 1))
-        others[:, : KNOTS.size] += np.diag(np.full(KNOTS.size, LEAN if self.step > 0.0 else 0.0))
+    def lean_guide(self, rows: Floats) -> Floats:
+        """Return controls (k, m, 9) as of rows (m, 9), with the guide `LEAN` further in +y at one knot if it moves."""
+        others = np.tile(rows, (KNOTS.size, 1, 1))
+        if self.step > 0.0:
+            share = np.append(0.0, np.cumsum(rows[:, DB_X])) / max(self.left, 1e-9)
+            knots, hats = np.append(0.0, KNOTS), LEAN * np.eye(KNOTS.size, KNOTS.size + 1, 1)
+            others[:, :, DG_Y] += np.diff([np.interp(share, knots, hat) for hat in hats], axis=1)
         return others
 
     @property
@@ -179,8 +182,15 @@ class Ahead:
 
     def bevel_use(self, z: Floats) -> Laterals:
         """Return the integral (N,) of the bevel's direction, relative to the present one, over the path (mm)."""
-        depth, roll = self._grid(z[:, self.depths], z[:, self.angles])
-        used: Laterals = (np.diff(depth, axis=1) * np.exp(1j * np.cumsum(roll, axis=1))).sum(axis=1)
+        order = np.argsort(z[:, self.depths], axis=1)
+        rolls, row = np.clip(z[:, self.depths], *self.depth[[0, -1]]), np.arange(len(z))[:, None]
+        ends = np.full((len(z), 1), self.depth[-1])
+        after = np.diff(np.concatenate([rolls[row, order], ends], axis=1), axis=1)
+        if self.setup.half_turns:
+            turned = np.pi * np.arange(1, self.slots + 1)
+        else:
+            turned = z[:, self.angles][row, order] - self.state.roll
+        used: Laterals = self.left - after.sum(axis=1) + (after * np.exp(1j * turned)).sum(axis=1)
         return used
 
     def angle_at(self, z: Floats, depth: Floats) -> Floats:

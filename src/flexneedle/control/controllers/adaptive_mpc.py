@@ -324,7 +324,7 @@ def _forecast(task: Task, memory: Memory, fitted: Identified, ahead: Ahead, foun
     """Return the forecast along the best path."""
     past = complex(past_target(found.trajectories.tips, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
-    leaning = ahead.controls(ahead.lean_guide(found.z))[0]
+    leaning = ahead.lean_guide(found.trajectories.controls[0])
     predicted = predict_ends(fitted, np.concatenate([found.trajectories.controls, leaning]))
     lever = Lever.of(ahead, predicted, task.plan.target)
     nodes, *leant = predicted.shapes[: 1 + KNOTS.size, -1]
