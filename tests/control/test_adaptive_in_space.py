@@ -94,7 +94,7 @@ def test_the_reach_after_a_step_is_a_disc(state, direction, beyond):
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
-    """Along its axis the guide corrects: the target may be anywhere. Across it, the weight is as without a guide."""
+    """Along its axis the guide corrects: the target may be anywhere. Across it, weight and precision are as without."""
     one_axis = SPACE.with_values({"setup.guide_axes": 1})
     there = inserted(Simulator(one_axis, threads=1))
     middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
@@ -110,13 +110,15 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
     assert across == pytest.approx(both, abs=0.02)
     assert across[0] > 1.0
     assert there.bevel * cmath.exp(1j * angle) == pytest.approx(side * 1j, abs=1e-9)
-    weight = {
-        term.name: term.weight
-        for term in adaptive_mpc.cost_terms(
-            task, estimate, memory, ahead, adaptive_mpc.find_ends(task, estimate, ahead)
-        )
-    }
-    assert weight["reach"] == task.settings.unguided_reach_weight
+    found = adaptive_mpc.cost_terms(
+        task, estimate, memory, ahead, adaptive_mpc.find_ends(task, estimate, ahead)
+    )
+    terms = {term.name: term for term in found}
+    assert terms["reach"].weight == task.settings.unguided_reach_weight
+    trajectories = adaptive_mpc.rollout_as_measured(estimate, ahead.controls(ahead.current[None])[0])
+    off = abs(adaptive_mpc.past_target(trajectories.tips, task.plan.target)[0])
+    precision = task.settings.precision_mm * ahead.left / task.plan.target[0]
+    assert terms["miss"].value(trajectories)[0] == pytest.approx(off + off**2 / precision)
 
 
 @pytest.fixture
