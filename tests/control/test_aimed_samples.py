@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 from adaptive import PHANTOM, estimate_of, rolls_at
-from flexneedle.control import path as path_module
+from flexneedle.control import samples
 from flexneedle.control.controllers import adaptive_mpc
-from flexneedle.control.path import (
-    KNOTS,
-    Ahead,
-    GuidePath,
-    add_pairs,
-    aim_samples,
-    propose_samples,
-    undo_miss,
-)
+from flexneedle.control.path import KNOTS, Ahead, GuidePath
+from flexneedle.control.samples import add_pairs, aim_samples, propose_samples, undo_miss
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from synthetic import make_plan
@@ -104,7 +97,7 @@ def test_some_leave_the_guide_as_it_is_and_have_other_rolls(axes):
 @AXES
 def test_pairs_of_rolls_undo_the_miss(axes, turn, rolls, monkeypatch):
     """Exactly if no other roll is between the two: along the chord from the bevel's direction."""
-    monkeypatch.setattr(path_module, "_SPREAD", 0.0)
+    monkeypatch.setattr(samples, "_SPREAD", 0.0)
     _, ahead = prepared(axes, rolls)
     # The bevel on the present side moves the end further from the target; after a half turn, towards it.
     miss = 0.3 * BEND[axes] / abs(BEND[axes]) * np.exp(1j * turn * (axes - 1))

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 import flexneedle
 from adaptive import corrected, rolls_at
-from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, path_of_plan, propose_samples
+from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, path_of_plan
+from flexneedle.control.samples import propose_samples
 from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, DG_Z, ROLL, X, Y

@@ -9,7 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from adaptive import corrected
-from flexneedle.control.path import KNOTS, Ahead, GuidePath, propose_samples
+from flexneedle.control.path import KNOTS, Ahead, GuidePath
+from flexneedle.control.samples import propose_samples
 from flexneedle.scenario.files import load_scenario
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.simulator.simulator import Simulator

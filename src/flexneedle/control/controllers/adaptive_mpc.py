@@ -2,16 +2,16 @@
 
 Start, needle, guide and tissue are identified (`estimation.identification`). The current path, the guide over depth and
 the depths at which the bevel rolls, is first the plan's (`control.path`). A better one is searched among its
-corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. With a guide they
-are aimed at the target: by the effect of guide and bevel on the end, which is known from the period before and from the
-current path, the guide undoes the miss that rolls and random corrections would leave. With the bevel alone,
-cross-entropy refines the samples.
+corrections, guide and rolls together (`control.samples`), each simulated on the fitted model from the tip to the
+target. With a guide they are aimed at the target: by the effect of guide and bevel on the end, which is known from the
+period before and from the current path, the guide undoes the miss that rolls and random corrections would leave, or a
+pair of rolls does. With the bevel alone, cross-entropy refines the samples.
 
 The cost is a length, so that one setting serves every needle and tissue: the miss and its square, the tissue energy at
 the target, in the mean and at its peak, the guide's travel and slope, rolls, and loads near the limits of the guard.
 The charge on travel is a dead band: the guide moves only where each millimetre lowers the other terms by more than its
 weight. Where only the bevel steers, the expected distance of the target from its reach is added; where the guide does,
-too, the expected miss that the bevel cannot correct after the guide has lost its effect (`control.reserve`).
+too, the expected miss that the bevel cannot correct, at the price of its correction by the guide (`control.reserve`).
 
 Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
 """
@@ -27,8 +27,9 @@ from pydantic import model_validator
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook, predict_ends
-from flexneedle.control.path import KNOTS, Ahead, GuidePath, aim_samples, path_of_plan, propose_samples
+from flexneedle.control.path import KNOTS, Ahead, GuidePath, path_of_plan
 from flexneedle.control.reserve import NO_RESERVE, Lever, reserve_of_bevel
+from flexneedle.control.samples import aim_samples, propose_samples
 from flexneedle.costs.normal import moments_above_zero
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target, per_energy
 from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
@@ -83,7 +84,7 @@ class AdaptiveMpc(Priors):
     """Miss d at which its square, d²/`precision_mm`, costs as much as d itself. If the guide may not move, times the
     remaining share of the path, at least five steps."""
     reserve_margin: NonNegative = 1.5
-    """Factor on the standard deviation of what readings will show where the guide has no effect any more; the bevel is
+    """Factor on the standard deviation of what readings will show where the guide has little effect left; the bevel is
     kept able to correct it. 0: it need not."""
     unguided_reach_margin: NonNegative = 3.0
     """Factor on the standard deviation of the distance in `unguided_reach_weight`."""
