@@ -74,7 +74,7 @@ def charge_miss(distance: Floats, precision: float = _PLAN_PRECISION_MM) -> Floa
         "Weight of the tissue energy at the target, relative to all tissue down to the target displaced by 1 mm.",
     ),
     adaptive_mpc=Weight(
-        "end energy", "end_energy_weight_mm", "mm", 0.3,
+        "end energy", "end_energy_weight_mm", "mm", 2.0,
         "As `plan.end_energy_weight_mm`.",
     ),
 )  # fmt: skip
@@ -121,7 +121,7 @@ def mean_energy(trajectories: Trajectories) -> Floats:
         "`end_energy_weight_mm` for the largest energy of all steps.",
     ),
     adaptive_mpc=Weight(
-        "peak energy", "peak_energy_weight_mm", "mm", 2.0,
+        "peak energy", "peak_energy_weight_mm", "mm", 1.0,
         "`end_energy_weight_mm` for the largest energy of the path ahead.",
         "larger to spare the tissue at the expense of accuracy.",
     ),
