@@ -136,7 +136,7 @@ def measure_threads(repeats: int) -> dict[str, Any]:
 def measure_plan(repeats: int) -> dict[str, Any]:
     """Plans of 128 samples and 25 iterations (no early stop), to the scenario's target."""
     scenario = flexneedle.load_scenario(PRESETS[1]).with_values(
-        {"plan.samples": 128, "plan.iterations": 25, "plan.max_iterations": 25, "plan.tolerance": 1e-6}
+        {"plan.samples": 128, "plan.iterations": 25, "plan.max_iterations": 25, "plan.tolerance_mm": 3e-6}
     )
     plans = [flexneedle.plan(scenario, seed=seed) for seed in range(min(3, repeats))]
     return {

@@ -17,7 +17,7 @@ PLANES = {1: ("x–y", "target"), 2: ("x–y", "x–z", "target")}
 """Planes of the section in which a target is dragged, by the number of axes."""
 DEPTHS, SHARES = (0.6, 1.05), (-0.125, 0.125)
 """Of the targets: of the scenario's own depth, and lateral offsets of the depth, as in the paper."""
-MODIFIED = {"control.adaptive_mpc.samples": 64}
+MODIFIED = {"control.adaptive_mpc.paths": 64}
 """So that 64 paths are sampled in each period."""
 SECTION, STATUS = "[data-panel=section]", "[data-panel=status]"
 VIEWS = {"section": SECTION, "plots": "[data-panel=plots]"}

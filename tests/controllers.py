@@ -27,7 +27,7 @@ def quick_plan():
 def short_plan():
     """A plan of 25 steps in its own scenario, with few samples for each controller that searches."""
     few = {"control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1}
-    few |= {"control.adaptive_mpc.samples": 12, "control.adaptive_mpc.iterations": 1}
+    few |= {"control.adaptive_mpc.paths": 12, "control.adaptive_mpc.unguided_iterations": 1}
     near = {
         "setup.tip_to_skin_mm": 5.0,
         "target.depth_mm": 20.0,

@@ -29,7 +29,7 @@ POSITIVE = _keys("""
     needle.bevel: length_mm
     phantom: variation_length_mm contact_spacing_mm element_mm step_mm
     phantom.structure: compression_length_factor bevel_length_factor
-    plan: tolerance
+    plan: tolerance_mm
     setup: guide_to_skin_mm tip_to_skin_mm stroke_mm max_advance_mm max_guide_step_mm max_guide_travel_mm
     setup: max_base_step_mm max_base_travel_mm max_base_turn_step_mrad insertion_speed_mm_s guide_speed_mm_s
     setup: base_speed_mm_s base_turn_speed_mrad_s rotation_speed_deg_s max_rotation_deg
@@ -73,8 +73,8 @@ COUNTS = {
     "control.ce_mpc.samples": (2, 100_000),
     "control.ce_mpc.iterations": (1, 1_000),
     "control.ce_mpc.horizon": (1, 1_000),
-    "control.adaptive_mpc.samples": (12, 100_000),
-    "control.adaptive_mpc.iterations": (1, 1_000),
+    "control.adaptive_mpc.paths": (12, 100_000),
+    "control.adaptive_mpc.unguided_iterations": (1, 1_000),
     "control.adaptive_mpc.effort": (1, 1_000),
     "control.broyden_mpc.horizon": (1, 20),
 }

@@ -1,4 +1,4 @@
-"""Weights of earlier costs of plan and controller: dropped or reported, never silently of another meaning."""
+"""Keys of earlier plans and controllers: dropped or reported, never silently of another meaning."""
 
 import pytest
 
@@ -14,6 +14,7 @@ OLD = {
     "plan.deflection_weight": 0.002,
     "plan.guide_weight": 1.0,
     "plan.flip_weight": 0.3,
+    "plan.tolerance": 1e-3,
 }
 OLD_OF_CONTROLLER = [
     *("urgency", "energy_weight_mm", "unguided_energy_weight_mm"),
@@ -55,6 +56,13 @@ def test_old_keys_of_the_default_controller_are_dropped_with_one_warning(keys):
     )
     assert "travel_weight" in line
     assert not set(keys) & set(CONTROLLERS[DEFAULT].settings.model_fields)
+
+
+def test_old_sizes_of_a_search_are_dropped_with_a_warning():
+    given = PHANTOM.with_values({"control.adaptive_mpc.samples": 24, "control.adaptive_mpc.iterations": 2})
+    line = r"^control\.adaptive_mpc\.samples, .*\.iterations: not used, .*: paths, unguided_iterations$"
+    with pytest.warns(ScenarioWarning, match=line):
+        assert with_controller_defaults(given) == with_controller_defaults(PHANTOM)
 
 
 def charge_nothing(trajectories):

@@ -21,6 +21,7 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, X, Y, Z
 
+_TOLERANCE = 1e-3  # spread of the elite's costs at convergence, relative to the first
 _LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 
 
@@ -67,7 +68,7 @@ def choose_step(
         elite=elite_count(control.samples, scenario.plan.elite_fraction),
         iterations=control.iterations,
         smoothing=scenario.plan.smoothing,
-        tolerance=scenario.plan.tolerance,
+        tolerance=_TOLERANCE,
     )
     steps_of_guide = nominal[:, DG_Y : DG_Y + 2]
     weight = control.orientation_weight_mm

@@ -32,8 +32,6 @@ from flexneedle.types import DB_X, DG_Y, DG_Z, Floats, X, Z
 _TARGET = "depth and lateral offsets in mm"
 _DEPTH_TOLERANCE_MM = 1e-6
 _PRECISE_MM = 0.1  # miss of a plan above which other searches are made
-# Cost to which the tolerance is relative. The first spread grows with the square of the target's lateral offset.
-_COST_SCALE_MM = 3.0
 # plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
@@ -259,9 +257,9 @@ def _search_settings(plan: PlanSettings, samples: int) -> Search:
         elite=elite_count(samples, plan.elite_fraction),
         iterations=max(plan.iterations, plan.max_iterations),
         smoothing=plan.smoothing,
-        tolerance=plan.tolerance,
+        tolerance=plan.tolerance_mm,
         usual=plan.iterations,
-        scale=_COST_SCALE_MM,
+        scale=1.0,
     )
 
 

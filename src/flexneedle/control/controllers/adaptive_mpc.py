@@ -73,12 +73,12 @@ _LOST = 0.5  # probability of a miss beyond the limit from which a longer search
 class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 
-    samples: int = count(48, least=12, most=100_000)
+    paths: int = count(48, least=12, most=100_000)
     """Paths per search; twice as many per iteration if the guide may not move."""
-    iterations: int = count(2, least=1, most=1_000)
-    """Iterations per control period if the guide may not move."""
+    unguided_iterations: int = count(2, least=1, most=1_000)
+    """Iterations per search if the guide may not move."""
     effort: int = count(3, least=1, most=1_000)
-    """Factor on `samples` in the first period, and in a repeated search if no path ends within
+    """Factor on `paths` in the first period, and in a repeated search if no path ends within
     `control.miss_limit_mm`."""
     precision_mm: Positive = 0.03
     """Miss d at which its square, d²/`precision_mm`, costs as much as d itself. If the guide may not move, times the
@@ -92,8 +92,11 @@ class AdaptiveMpc(Priors):
     @model_validator(mode="before")
     @classmethod
     def _drop_old_keys(cls, values: Any) -> Any:
-        why = "the controller charges the energy of the whole path now"
-        return drop_old_keys(values, "control.adaptive_mpc", _OLD_KEYS, why, ADAPTIVE_MPC)
+        weights = ", ".join(weight.key for weight in ADAPTIVE_MPC.settings())
+        why = f"the controller charges the energy of the whole path now; its weights: {weights}"
+        values = drop_old_keys(values, "control.adaptive_mpc", _OLD_KEYS, why)
+        why = "with a guide a search has one iteration now; its sizes: paths, unguided_iterations"
+        return drop_old_keys(values, "control.adaptive_mpc", ("samples", "iterations"), why)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +200,7 @@ def search_path(
     """
     settings, lower, upper = task.settings, *ahead.bounds
     guided = ahead.step > 0.0
-    count = effort * settings.samples * (1 if guided else _MORE_ALONE)
+    count = effort * settings.paths * (1 if guided else _MORE_ALONE)
     ends = find_ends(task, fitted, ahead)
     known = np.isfinite(ends).all()
     z = propose_samples(ahead, count, rng, complex(-ends[0]) if known and not ahead.setup.half_turns else 1.0)
@@ -206,7 +209,7 @@ def search_path(
     charged = cost_terms(task, fitted, memory, ahead, ends)
     rollout = partial(rollout_as_measured, fitted, wanted=outputs_of(charged))
     variables = Variables(lower, upper, z[0], z.std(axis=0), lambda z: ahead.controls(z)[0])
-    rounds = 1 if guided else settings.iterations
+    rounds = 1 if guided else settings.unguided_iterations
     search = Search(count, elite_count(count, _ELITE_FRACTION), rounds, _SMOOTHING, _TOLERANCE)
     return find_best(variables, rollout, charged, search, rng, first=z)
 

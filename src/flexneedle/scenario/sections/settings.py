@@ -38,7 +38,8 @@ class Target(Section):
         return self.depth_mm, self.lateral_mm, self.lateral_z_mm
 
 
-_OLD_WEIGHTS = (
+_OLD_KEYS = (
+    "tolerance",
     "accuracy_weight_per_mm",
     "energy_weight_per_mj",
     "deflection_weight",
@@ -63,8 +64,8 @@ class PlanSettings(Section):
     """Weight of the previous mean and covariance."""
     primitives: int = count(6, least=1, most=1_000)
     """Primitives per control sequence, each constant over its share of the travel."""
-    tolerance: Positive = 1e-3
-    """Spread of the elite's costs at convergence, relative to 3 mm; of `ce-mpc`, relative to the first iteration."""
+    tolerance_mm: Positive = 0.003
+    """Spread of the elite's costs at convergence."""
     advance_sigma_mm: NonNegative = 0.03
     """Initial standard deviation of the advance per step; 0: fixed."""
     guide_sigma_mm: NonNegative = 0.06
@@ -76,9 +77,11 @@ class PlanSettings(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _drop_old_weights(cls, values: Any) -> Any:
-        """Return the values without the weights of the earlier cost, and report the weights of own terms."""
-        values = drop_old_keys(values, "plan", _OLD_WEIGHTS, "the cost of a plan is in mm now", PLAN)
+    def _drop_old_keys(cls, values: Any) -> Any:
+        """Return the values without the keys of the earlier cost, and report the weights of own terms."""
+        weights = ", ".join(weight.key for weight in PLAN.settings())
+        why = f"the cost of a plan is in mm now; its weights: {weights}; its tolerance: tolerance_mm"
+        values = drop_old_keys(values, "plan", _OLD_KEYS, why)
         if isinstance(values, Mapping) and isinstance(values.get("own_terms"), list | tuple):
             line = (
                 "plan.own_terms: the cost of a plan is in mm now; divide weights of an older scenario by 20"

@@ -24,17 +24,16 @@ def name_functions(given: Any) -> Any:
     return f"{given.__module__}:{given.__qualname__}" if isroutine(given) else given
 
 
-def drop_old_keys(values: Any, section: str, old: Collection[str], why: str, cost: Cost) -> Any:
-    """Return the values of a section without keys of an earlier cost; a ScenarioWarning names them, for one version."""
+def drop_old_keys(values: Any, section: str, old: Collection[str], why: str) -> Any:
+    """Return the values of a section without keys of an earlier version; a ScenarioWarning names them, for one version.
+
+    why: the reason, with the keys to use instead.
+    """
     if not isinstance(values, Mapping):
         return values
     if found := [key for key in values if key in old]:
-        keys, weights = (
-            ", ".join(f"{section}.{key}" for key in found),
-            ", ".join(w.key for w in cost.settings()),
-        )
-        line = f"{keys}: not used, since {why}; its weights: {weights}"
-        warnings.warn(line, ScenarioWarning, stacklevel=3)
+        keys = ", ".join(f"{section}.{key}" for key in found)
+        warnings.warn(f"{keys}: not used, since {why}", ScenarioWarning, stacklevel=3)
     return {key: value for key, value in values.items() if key not in old}
 
 
