@@ -27,7 +27,7 @@ _LEVERS = (4.0, 2.0)  # of the guide at depths before, relative to the least
 class Lever:
     """Effect on the tip at the target of corrections of the guide at the knots of a path."""
 
-    depth: Floats  # depths of the begin of the path and of its knots (k + 1,), mm
+    depth: Floats  # depths of the beginning of the path and of its knots (k + 1,), mm
     effect: Floats  # lateral motion of the end per correction (k,)
 
     @staticmethod
@@ -44,7 +44,7 @@ class Lever:
 
 
 class Reserve(NamedTuple):
-    """Arguments of the term `lost_reserve`: the bevel, and the unknowns, where the guide has no effect."""
+    """Arguments of the term `lost_reserve`: the bevel, and the unknowns, where the guide has little effect or none."""
 
     begins: Floats  # depths (b,), mm
     sds: Floats  # standard deviations (b,), mm, of the uncorrected end that readings to come will show below them

@@ -12,11 +12,10 @@ _SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step, added to it: l
 _FURTHEST = 0.3  # largest move of a roll, of the path left
 _WIDEST = 1.0  # largest change of an angle (rad)
 _DECADES = 2.0  # over which the scales of the samples spread
-_FINER_DECADES = (-2.5, -0.3)  # of the scales of samples around the best
+_FINER_DECADES = (-2.5, -0.3)  # of the scales of the guide's changes in aimed samples
 _OVERSHOOT = 1.2  # largest share of a miss that an aimed sample undoes
-_BY_BEVEL = (
-    3  # the first of a dozen samples that the bevel aims, without the guide; the next one moves it, too
-)
+# The first of a dozen samples that the bevel aims, without the guide; the next one moves it, too.
+_BY_BEVEL = 3
 _PAIRS_NOW = 0.5  # share of pairs of rolls that begin now, over those that begin later
 _LEAST_CHORD = 0.1  # motion of the bevel's direction in a pair of rolls, from which it is aimed
 _SPREAD = 0.3  # of the lengths of aimed pairs, logarithmic

@@ -53,9 +53,8 @@ LEAST_SD = 1e-6
 _LATERAL_STEPS = (0.05, 3e-4, 0.05, 0.05, 1e-3)  # for differences, on each axis: mm, rad, mm, mm, rad
 _STEPS = (0.05, 0.02)  # of bevel factor and clearance: 1, mm
 _LOG_STEP = 0.05
-_SHIFT_STEP = (
-    2.0 / 3.0
-)  # of the standard deviation, towards the skin: below the target a boundary has no effect
+# Share of the standard deviation, towards the skin: below the target a boundary has no effect.
+_SHIFT_STEP = 2.0 / 3.0
 _LEAST_SHIFT = 0.2  # mm
 _WIDEST = 4.0  # standard deviations by which a parameter may deviate from its prior
 _MOST_CELLS = 200

@@ -15,9 +15,8 @@ from flexneedle.scenario.tissue.layer import Layer, laws_of
 
 _LENGTH = 0.5  # over which the stiffness falls by 1/e, as a share of the displacement at which tearing begins
 _RESIDUAL = 0.02  # share of the stiffness that is left; above 0, so that the energy remains convex
-_TABLED = (
-    5.0  # displacements at which tearing begins, up to which the law is tabled: e^(−8) of the fall is left
-)
+# Displacements at which tearing begins, up to which the law is tabled: e^(−8) of the fall is left.
+_TABLED = 5.0
 
 
 @dataclass(frozen=True)

@@ -63,9 +63,8 @@ _OLD_KEYS = (
 )
 _MORE_ALONE = 2  # factor on the samples with the bevel alone
 _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
-_PRICE_OF_ENERGY = (
-    2.0  # cost of a motion of the guide, with the energy in its wake, over the charge on travel
-)
+# Cost of a motion of the guide, with the energy in its wake, over the charge on travel.
+_PRICE_OF_ENERGY = 2.0
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -84,8 +83,8 @@ class AdaptiveMpc(Priors):
     """Miss d at which its square, d²/`precision_mm`, costs as much as d itself. If the guide may not move, times the
     remaining share of the path, at least five steps."""
     reserve_margin: NonNegative = 1.5
-    """Factor on the standard deviation of what readings will show where the guide has little effect left; the bevel is
-    kept able to correct it. 0: it need not."""
+    """Factor on the standard deviation of errors that show late; the path leaves the bevel enough reach to correct
+    them. 0: no reserve."""
     unguided_reach_margin: NonNegative = 3.0
     """Factor on the standard deviation of the distance in `unguided_reach_weight`."""
 

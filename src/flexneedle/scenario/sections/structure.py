@@ -1,4 +1,4 @@
-"""Structural mismatch: differences of a phantom that no parameter of a controller's model describes."""
+"""Structural mismatch: differences of a phantom from the form of a controller's model."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -26,7 +26,7 @@ class HiddenLayer(Section):
 
 
 class Structure(Section):
-    """Section `phantom.structure`: differences of the phantom that no parameter of the model describes."""
+    """Section `phantom.structure`: differences of the phantom from the form of the model."""
 
     alpha: Alpha | None = None
     """α in all layers. Not set: each layer's value."""
