@@ -66,7 +66,7 @@ def test_the_worst_depth_counts_and_what_is_known_costs_nothing():
 
 
 def test_a_needle_that_turns_to_any_angle_has_one_bound_whichever_way_it_is_bent():
-    """The same in all directions, and half of what two sides cost a needle that has both to fear."""
+    """The same in all directions; straight, as much as a needle that bends to both sides."""
     begins, sds = np.array([0.0]), np.array([0.3])
     turned = [
         reserve(path_of(10.0, angle=angle), begins=begins, sds=sds, any_angle=True)[0]

@@ -29,9 +29,10 @@ def stiffness(phantom):
 
 def test_the_factor_is_linear_in_the_deepest_position_of_the_tip_and_ends_at_the_target():
     drift = ModulusDrift(truth(-0.2)._truth)
-    factors = [
-        drift.factor for depth in (-5.0, 0.0, 10.0, 5.0, 20.0, 40.0, 60.0) if drift.advance(depth) is not None
-    ]
+    factors = []
+    for depth in (-5.0, 0.0, 10.0, 5.0, 20.0, 40.0, 60.0):
+        drift.advance(depth)
+        factors.append(drift.factor)
     np.testing.assert_allclose(factors, [1.0, 1.0, 0.95, 0.95, 0.9, 0.8, 0.8], rtol=1e-12)
 
 

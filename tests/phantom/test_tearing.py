@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.mechanics.law import tables
+from flexneedle.mechanics.model import CONTACT
 from flexneedle.phantom.tearing import TornLaw
 from flexneedle.scenario.tissue.laws import LAWS
 from flexneedle.simulator.simulator import Simulator
@@ -104,4 +105,5 @@ def test_only_contacts_tear_in_the_model():
     phantom = make_phantom(IDEAL, "model", yield_mm=0.5)
     model, intact = phantom._plant._simulator.model, Simulator(IDEAL, threads=1).model
     assert (model.layers == intact.layers).all()
+    assert ((model.nodes["law"] != intact.nodes["law"]) == (model.nodes["kind"] == CONTACT)).all()
     assert len(model.laws) == len(intact.laws) + len(IDEAL.tissue)

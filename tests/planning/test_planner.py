@@ -355,8 +355,7 @@ def test_a_force_of_the_guide_is_charged_if_it_has_a_limit():
     plan = coarse({"guard.guide_force_n": 0.5 * force, "plan.limit_weight_mm": 0.0})
     assert (plan.limit, plan.terms["guide force"]) == ("guard.guide_force_n", 0.0)
     assert plan.refusal.startswith("guide force")
-    charged = coarse({"guard.guide_force_n": 0.5 * force})
-    assert charged.terms["guide force"] > 0.0 or not charged.refusal
+    assert not coarse({"guard.guide_force_n": 0.5 * force}).refusal
 
 
 def test_a_plan_that_two_searches_miss_is_made_of_rolls_alone(monkeypatch):

@@ -164,7 +164,7 @@ def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
     adaptive_mpc=Weight(
         "travel", "travel_weight", "–", 0.12,
         "Weight of the guide's travel in the tissue: it moves only where that lowers the rest of the cost by more.",
-        "larger for less guide motion at the expense of accuracy.",
+        "larger for less guide motion; the bevel then rolls more often.",
     ),
 )  # fmt: skip
 def guide_travel(trajectories: Trajectories) -> Floats:
