@@ -61,7 +61,8 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
 def _needle(insertion: Insertion) -> tuple[str, str]:
     """Return the row of the phantom, or of the rig."""
     if not insertion.rig:
-        return "phantom", insertion.phantom
+        mismatch = insertion.plan.scenario.phantom.structure.model_dump(exclude_defaults=True)
+        return "phantom", ", ".join([insertion.phantom, *mismatch])
     return "rig", f"{insertion.rig}{', not moved; virtual needle' if insertion.dry_run else ''}"
 
 
