@@ -150,7 +150,7 @@ far-targets: setup  ## plans to targets up to the edge of the reach, near the sk
 plan-reach: setup  ## plans of 200 random worlds, and what a search of 20 times the size finds where they miss
 	$(BIN)/python studies/plan_reach.py $(call quick,--worlds 100000 1 --factor 2)
 
-front: setup  ## error against peak tissue energy of five controllers and the oracle on 40 random worlds, with the figure (DIR=runs/front; minutes)
+front: setup  ## error against peak tissue energy of five controllers and the oracle on 40 random worlds from soft tissue to stiff gel, with the figure (DIR=runs/front; minutes)
 	$(BIN)/python studies/front.py --out $(OUT) $(call quick,--worlds 100000 1 --oracle 1 --samples 16 --iterations 3)
 
 wide: setup  ## 200 random worlds from soft tissue to stiff gel with four controllers, and the report (DIR=runs/wide; hours)

@@ -1,6 +1,6 @@
 """Error against peak tissue energy of controllers on random worlds, and of the oracle, which knows the phantom.
 
-    python studies/front.py [--worlds FIRST COUNT] [--kind world|wide] [--rig RIG] [--no-guided]
+    python studies/front.py [--worlds FIRST COUNT] [--kind wide|world] [--rig RIG] [--no-guided]
         [--controllers NAME ...] [--oracle N] [--samples N] [--iterations N] [--workers N] [--out FOLDER]
 
 World n is planned with seed 0 and inserted with seed n by each controller. The oracle is the plan of the planner's
@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 import flexneedle
-from flexneedle import Insertion, Plan, Scenario
+from flexneedle import Insertion, Plan
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.errors import RunError, describe_error
 from flexneedle.figures.layout import Look, look
@@ -42,71 +42,26 @@ from flexneedle.lab.study.figures.front import FrontSample, draw_front
 from flexneedle.lab.study.figures.panels import Panel
 from flexneedle.lab.study.pools import open_processes
 from flexneedle.loop.virtual import Seeds
-from flexneedle.phantom.draw import Truth, draw
+from flexneedle.phantom.draw import draw
 from flexneedle.phantom.kernels import compile_kernels
-from flexneedle.planning import planner
-from flexneedle.planning.problem import PlanProblem, make_problem
 from flexneedle.scenario.library import WORLD_KINDS
-from flexneedle.scenario.worlds import PLANE, RIGS, TRAINING, has_rig, world
+from flexneedle.scenario.worlds import PLANE, RIGS, TRAINING, WIDE, has_rig, world
 from flexneedle.simulator.batch import count_cores
-from flexneedle.simulator.simulator import Simulator
-from flexneedle.simulator.state import State
-from flexneedle.types import STILL
+from oracle import find_oracle
 
 ORACLE, OPEN_LOOP = "oracle", "open-loop"
 SHOWN = (OPEN_LOOP, "resolved-rate", "broyden-mpc", "ce-mpc", "adaptive-mpc")
 STRATEGY = "manipulation"
-LOADS = ("peak_energy_uj", "mean_energy_uj", "end_energy_uj", "guide_travel_mm", "rolls")
+ENERGIES = ("peak_energy_uj", "mean_energy_uj", "end_energy_uj")
+LOADS = (*ENERGIES, "guide_travel_mm", "rolls", "least_stretch")
 COLUMNS = (
     *("world", "controller", "outcome", "reason", "true_error_mm", *LOADS, "energy_scale_uj"),
     *("peak_energy_relative", "coverage", "planned_error_mm", *(f"planned_{name}" for name in LOADS)),
 )
 _SDS = {1: 1.9600, 2: 2.4477}  # 95 % of a normal distribution on one axis and on two
-_MOST = 5  # largest number of iterations of the oracle's search over its usual one
 _LOOK_OF_ORACLE = Look(INK, "X")
 
 Row = dict[str, Any]
-
-
-class TrueSimulator(Simulator):
-    """Simulator with the parameters of a phantom, whose needle starts from the phantom's true start."""
-
-    def __init__(self, truth: Truth, scenario: Scenario) -> None:
-        super().__init__(scenario, threads=1)
-        self._truth = truth
-
-    def start(self, roll: float = 0.0) -> State:
-        """Return the needle at its true start, rolled by `roll` (rad)."""
-        state, truth = super().start(roll), self._truth
-        _, y, z, theta, psi = state.base.tolist()
-        moved = state.with_estimate(
-            base=(y + truth.base_y, z + truth.base_z),
-            slope=(theta + truth.base_turn, psi + truth.base_psi),
-            tip_load=truth.load,
-        )
-        return self.step(moved, STILL)
-
-
-def find_oracle(truth: Truth, samples: int, iterations: int, seed: int = 0) -> Plan:
-    """Return the plan that knows the phantom: the planner's search on the true model from the true start.
-
-    samples, iterations: of each search, instead of the scenario's; as in a plan, a miss is searched again.
-    """
-    size = {"plan.samples": samples, "plan.iterations": iterations, "plan.max_iterations": _MOST * iterations}
-    scenario = truth.scenario.with_values(size)
-    simulator, rng = TrueSimulator(truth, scenario), np.random.default_rng(seed)
-    problem = make_problem(scenario, scenario.target.position, STRATEGY)
-
-    def search(changed: PlanProblem) -> Plan:
-        solution = planner._search(simulator, changed, rng, lambda _: None)
-        return planner._carry_out(simulator, problem, STRATEGY, seed, solution)
-
-    found = search(problem)
-    for change in planner._other_searches(problem):
-        if found.error_mm <= planner._PRECISE_MM:
-            break
-        found = planner._choose_better(found, search(change(problem)))
-    return found
 
 
 @dataclass(frozen=True)
@@ -139,7 +94,7 @@ def measure_world(job: Job) -> list[Row]:
 
     def oracle(samples: int, iterations: int) -> Row:
         truth = draw(scenario, np.random.default_rng(Seeds.of(job.number).phantom))
-        return describe_oracle(find_oracle(truth, samples, iterations), plan.target)
+        return describe_oracle(find_oracle(truth, STRATEGY, samples, iterations), plan.target)
 
     names = [
         name for name in job.controllers if scenario.setup.has_guide or not CONTROLLERS[name].needs_guide
@@ -202,8 +157,8 @@ def find_coverage(done: Insertion) -> float:
 def table(rows: Sequence[Row], controllers: Sequence[str]) -> str:
     """Return a Markdown table: a row for each controller and the oracle."""
     head = (
-        "| | n | done | peak / open loop | mean / open loop | peak (µJ) | peak (E₁) | guide travel (mm), mean "
-        "| error (mm), mean | median | 95 % | max | coverage |"
+        "| | n | done | peak / open loop | mean / open loop | end / open loop | peak (µJ) | peak (E₁) "
+        "| guide travel (mm), mean | rolls, mean | least stretch | error (mm), mean | median | 95 % | max | coverage |"
     )
     done = [row for row in rows if row["outcome"] == "done"]
     open_loop = {row["world"]: row for row in done if row["controller"] == OPEN_LOOP}
@@ -211,7 +166,7 @@ def table(rows: Sequence[Row], controllers: Sequence[str]) -> str:
         line(name, [row for row in rows if row["controller"] == name], open_loop)
         for name in (*controllers, ORACLE)
     ]
-    return "\n".join([head, "|---|" + "---:|" * 12, *filter(None, lines)])
+    return "\n".join([head, "|---|" + "---:|" * 15, *filter(None, lines)])
 
 
 def line(name: str, rows: Sequence[Row], open_loop: dict[str, Row]) -> str:
@@ -221,12 +176,13 @@ def line(name: str, rows: Sequence[Row], open_loop: dict[str, Row]) -> str:
     done = [row for row in rows if row["outcome"] == "done"]
     errors = np.array([row["true_error_mm"] for row in done])
     values = [
-        *(average_ratio(done, open_loop, key) for key in ("peak_energy_uj", "mean_energy_uj")),
+        *(average_ratio(done, open_loop, key) for key in ENERGIES),
         *(
             average_geometrically([row[key] for row in done])
             for key in ("peak_energy_uj", "peak_energy_relative")
         ),
-        average([row["guide_travel_mm"] for row in done]),
+        *(average([row[key] for row in done]) for key in ("guide_travel_mm", "rolls")),
+        min((row["least_stretch"] for row in done), default=math.nan),
         average(errors),
         *(np.quantile(errors, (0.5, 0.95, 1.0)).tolist() if done else [math.nan] * 3),
         average([row["coverage"] for row in done]),
@@ -351,7 +307,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar=("FIRST", "COUNT"),
         help="worlds with the rig",
     )
-    add("--kind", choices=WORLD_KINDS, default=WORLD_KINDS[0])
+    add("--kind", choices=WORLD_KINDS, default=WIDE)
     add("--rig", choices=RIGS, default=PLANE)
     add(
         "--guided",

@@ -10,13 +10,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 import front
+import oracle
 from flexneedle.loop.virtual import Seeds
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.plants import ModelPlant
 from flexneedle.scenario.worlds import world
+from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL
 
-SMALL = ["--samples", "16", "--iterations", "3", "--workers", "1"]
+SMALL = ["--kind", "world", "--samples", "16", "--iterations", "3", "--workers", "1"]
 
 
 @pytest.mark.long
@@ -35,7 +37,7 @@ def test_a_world_has_rows_of_controllers_and_oracle_the_same_each_time(tmp_path,
     assert all(float(row["peak_energy_uj"]) > 0.0 for row in rows)
     cells = cells_of(tables[0])
     assert list(cells) == ["open-loop", "adaptive-mpc", "oracle"]
-    assert cells["open-loop"][:4] == ["1", "1", "1", "1"]
+    assert cells["open-loop"][:5] == ["1", "1", "1", "1", "1"]
     ratio = float(rows[1]["mean_energy_uj"]) / float(rows[0]["mean_energy_uj"])
     assert float(cells["adaptive-mpc"][3]) == pytest.approx(ratio, rel=5e-3)
 
@@ -50,7 +52,7 @@ def test_the_oracle_plans_on_the_true_phantom_from_its_true_start():
     """Against the model plant of the phantom, which carries the plan out."""
     drawn = draw(world(4), np.random.default_rng(Seeds.of(4).phantom))
     truth = replace(drawn, base_y=0.7, base_turn=4e-3, load=(2e-3, 0.0))
-    plan = front.find_oracle(truth, 16, 3)
+    plan = oracle.find_oracle(truth, "manipulation", 16, 3)
     plant = ModelPlant(truth, plan.roll)
     tips, energies = [plant.tip], [plant.strain_energy]
     for row in plan.controls:
@@ -64,14 +66,20 @@ def test_the_oracle_plans_on_the_true_phantom_from_its_true_start():
 
 def test_without_an_error_of_the_start_the_needle_is_as_in_a_plan():
     truth = draw(world(4, "perfect"), np.random.default_rng(0))
-    ours, theirs = front.TrueSimulator(truth, truth.scenario), front.Simulator(truth.scenario, 1)
+    ours, theirs = oracle.TrueSimulator(truth, truth.scenario), Simulator(truth.scenario, 1)
     assert_allclose(ours.start(math.pi).tip, theirs.step(theirs.start(math.pi), STILL).tip, atol=1e-12)
 
 
 def made(number, controller, peak, outcome="done", error=0.1):
     row = {"world": f"world:{number}", "controller": controller, "outcome": outcome, "true_error_mm": error}
-    loads = {"peak_energy_uj": peak, "mean_energy_uj": 0.5 * peak, "energy_scale_uj": 100.0}
-    return front.complete(row | loads | {"guide_travel_mm": 2.0})
+    loads = {"peak_energy_uj": peak, "mean_energy_uj": 0.5 * peak, "end_energy_uj": 0.1 * peak}
+    more = {
+        "energy_scale_uj": 100.0,
+        "guide_travel_mm": 2.0,
+        "rolls": number,
+        "least_stretch": 1.0 - 0.1 * number,
+    }
+    return front.complete(row | loads | more)
 
 
 def test_energies_are_compared_on_the_same_world_where_both_are_done():
@@ -82,10 +90,10 @@ def test_energies_are_compared_on_the_same_world_where_both_are_done():
         made(4, "ce-mpc", 20.0, error=0.6),
     ]
     cells = cells_of(front.table(rows, ["open-loop", "ce-mpc"]))
-    assert cells["open-loop"][:4] == ["3", "3", "1", "1"]
+    assert cells["open-loop"][:5] == ["3", "3", "1", "1", "1"]
     # peaks 20, 8 and 20 µJ: twice and eight times the peak of open loop, which did not insert into world 4
-    assert cells["ce-mpc"][:6] == ["4", "3", "4", "4", "14.7", "0.147"]
-    assert cells["ce-mpc"][6:] == ["2", "0.3", "0.2", "0.56", "0.6", "–"]
+    assert cells["ce-mpc"][:7] == ["4", "3", "4", "4", "4", "14.7", "0.147"]
+    assert cells["ce-mpc"][7:] == ["2", "2.33", "0.6", "0.3", "0.2", "0.56", "0.6", "–"]
     assert front.list_unfinished(rows) == ["world:3, ce-mpc: failed, "]
 
 
@@ -115,8 +123,9 @@ def test_a_decision_is_covered_if_its_interval_has_the_final_miss(axes, misses, 
 
 
 def test_worlds_without_the_rig_are_skipped(capsys):
-    """Worlds 15 and 16 have no guide."""
-    assert front.parse(["--worlds", "14", "2"]).numbers == [14, 17]
+    """Worlds 15 and 16 of kind `world` have no guide, of kind `wide`, the default, world 15."""
+    assert front.parse(["--worlds", "14", "2"]).numbers == [14, 16]
+    assert front.parse(["--kind", "world", "--worlds", "14", "2"]).numbers == [14, 17]
     assert front.parse(["--worlds", "14", "2", "--no-guided"]).numbers == [14, 15]
     assert front.parse(["--worlds", "14", "1", "--rig", "no-guide"]).numbers == [15]
     for worlds in (("-1", "5"), ("0", "0"), ("99999", "2")):

@@ -27,7 +27,7 @@ from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_X, DG_Y, DG_Z, Floats, X, Z
+from flexneedle.types import DB_X, DG_Y, DG_Z, Floats, Point, X, Z
 
 _TARGET = "depth and lateral offsets in mm"
 _DEPTH_TOLERANCE_MM = 1e-6
@@ -70,9 +70,15 @@ def plan(
         raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
     goal = scenario.target.position if target is None else check_point("target", target, _TARGET)
     check_target(scenario, *goal)
-    begun, rng = time.perf_counter(), np.random.default_rng(seed)
-    simulator = Simulator(scenario, threads)
-    problem, progress = make_problem(scenario, goal, strategy), _report_to(listeners, strategy)
+    begun, simulator = time.perf_counter(), Simulator(scenario, threads)
+    found = search_plan(simulator, goal, strategy, seed, _report_to(listeners, strategy))
+    return replace(found, seconds=time.perf_counter() - begun)
+
+
+def search_plan(simulator: Simulator, goal: Point, strategy: str, seed: int, progress: OnIteration) -> Plan:
+    """Return the plan from the simulator's start to the goal (mm), as `plan` does, for a simulator of any needle."""
+    scenario, rng = simulator.scenario, np.random.default_rng(seed)
+    problem = make_problem(scenario, goal, strategy)
     found = _carry_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
     for change in _other_searches(problem):
         if found.error_mm <= _PRECISE_MM:
@@ -81,7 +87,7 @@ def plan(
         after = count_iterations(progress, found.iterations, usual, found.cost)
         again = _search(simulator, change(problem), rng, after)
         found = _choose_better(found, _carry_out(simulator, problem, strategy, seed, again))
-    return replace(found, seconds=time.perf_counter() - begun)
+    return found
 
 
 def _other_searches(problem: PlanProblem) -> tuple[Callable[[PlanProblem], PlanProblem], ...]:
