@@ -187,7 +187,7 @@ def _report(folder: Path, as_json: bool, seconds: float) -> int:
 
 def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
     heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "periods")
-    load_heads = ("", "energy (µJ)", "over planned", "over E₁", "stretch", "travel", "flips")
+    load_heads = ("", "energy (µJ)", "over planned", "over E₁", "stretch", "travel", "rolls")
     varied = [factor.key for factor in found.design.factors if factor.varies]
     pooled = found.whole if len(found.groups) > len(found.whole) else ()
     rows = [(_label(group.levels, varied) or group.name, group) for group in found.groups]
@@ -197,8 +197,8 @@ def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
     print("Finished insertions: true error (mm); largest number of periods, relative to the plan.\n")
     print_table("Load on the tissue", load_heads, ((name, *_format_load(group)) for name, group in rows))
     print(
-        "Means over finished insertions: peak, mean and end of the tissue energy; least stretch; guide travel in the "
-        "tissue (mm) and flips (planned)."
+        f"Over finished insertions: {found.energy_means} of peak, mean and end of the tissue energy; means of each "
+        "insertion's least stretch, guide travel in the tissue (mm) and rolls (planned)."
     )
     if unconverged:
         print(f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet.")

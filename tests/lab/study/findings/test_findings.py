@@ -105,6 +105,24 @@ def test_controllers_are_compared_pair_by_pair(read, more, verdict):
     assert found.verdict == verdict
 
 
+def test_loads_of_controllers_are_compared_pair_by_pair(read):
+    """Peaks twice and eight times as in open loop (one pair without energy): 4; 1 mm more of travel."""
+    rows, _ = of_both(2)
+    for row, factor in zip(rows[4:], (2.0, 8.0, 4.0, 0.0), strict=True):
+        own = rows[row["index"] - 4]
+        row |= {
+            "peak_energy_uj": factor * own["peak_energy_uj"],
+            "mean_energy_uj": 0.5 * own["mean_energy_uj"],
+        }
+        row["guide_travel_mm"] = own["guide_travel_mm"] + 1.0
+    found = read(rows)
+    (found,) = compare_controllers(found.rows, find_design(found))
+    values = [
+        each.value for each in (found.peak_energy_ratio, found.mean_energy_ratio, found.guide_travel_mm)
+    ]
+    assert_allclose(values, (4.0, 0.5, 1.0))
+
+
 def test_a_pair_with_one_unfinished_is_left_out_and_few_pairs_have_no_verdict(read):
     rows, _ = of_both(5)
     rows[2], rows[13] = unfinished(rows[2]), unfinished(rows[13], "error", "?")

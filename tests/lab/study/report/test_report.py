@@ -177,7 +177,11 @@ def test_the_headline_compares_the_default_with_the_others(report_on, error, ver
     for row in rows:
         if error and row["controller"] != "bevel-only":
             row["true_error_mm"] = error + 0.001 * row["seed"]
-    assert f"{OURS} is better than {verdict}" in report_on(rows)[1].text
+        row["peak_energy_uj"] = {OURS: 3.0, "open-loop": 2.0, "bevel-only": 1.0}[row["controller"]]
+    text = report_on(rows)[1].text
+    assert f"{OURS} is better than {verdict}" in text
+    assert "Its peak tissue energy is 1.5 to 3 times as large." in text
+    assert "pairs); its peak tissue energy is 1.5 times as large." in text
 
 
 def test_the_headline_of_few_phantoms_names_no_verdict(report_on):
@@ -196,7 +200,8 @@ def test_effort_is_reported_relative_to_the_plan(report_on):
     rows[1] |= {"unconverged_periods": 5}
     report, page = report_on(rows)
     head = page.text[: page.text.index("Figures")]
-    assert "bevel flips 3.00 planned 1.00" in head
+    assert "bevel rolls 3.00 planned 1.00" in head
+    assert "peak tissue energy 9 µJ 0.00225 E₁" in head
     assert "peak tissue energy / planned 1.50 1.50 to 1.50" in head
     assert "end tissue energy / planned 1.20 1.20 to 1.20" in head
     assert "guide travel 3.00 mm planned 2.00 mm" in head

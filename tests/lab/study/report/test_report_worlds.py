@@ -66,6 +66,8 @@ def row_of(study, index, bounded):
         "planned_peak_energy_uj": 0.5,
         "energy_scale_uj": 9.0,
         "guide_travel_mm": float(point.world),
+        "flips": point.world,
+        "least_stretch": 1.0 - 0.1 * (point.world % 4),
         "planned_guide_travel_mm": 2.0,
         "unconverged_periods": 0,
         "reach_mm": REACH[point.world] if bounded else None,
@@ -134,13 +136,23 @@ def test_errors_shares_and_energy_are_over_finished_insertions(report):
     assert_allclose((*measured, guided.end_energy_ratio), expected)
     assert_allclose((guided.peak_energy_ratio, guided.peak_energy_relative), (6.0, 1.0 / 3.0))
     assert np.isnan(guided.mean_energy_ratio)
-    assert (guided.guide_travel_mm, guided.planned_guide_travel_mm) == (2.0, 2.0)
+    assert (guided.guide_travel_mm, guided.planned_guide_travel_mm, guided.flips) == (2.0, 2.0, 2.0)
+    assert_allclose((guided.peak_energy_uj, guided.least_stretch), (3.0, 0.7))
     assert_allclose(guided.within_twice_open_loop, 2 / 3)  # 0.02 ≤ 0.1, 0.5 > 0.4, 1.6 ≤ 3.0
     assert_allclose(guided.within_open_loop, 2 / 3)  # 0.02 ≤ 0.21, 0.5 > 0.4, 1.6 ≤ 1.7
     assert_allclose(guided.within_reach, 2 / 3)  # 0.02 and 0.5 ≤ 0.5, 1.6 above
     assert free.within_twice_open_loop == free.within_open_loop == 1.0  # open loop did not finish in world 16
     assert free.within_reach == 1.0  # 4.4 ≤ 4.0 + 0.5
     assert (guided.failures, free.failures) == (1, 0)  # world 31 is 3 mm out of reach
+
+
+def test_energies_of_groups_are_geometric_means(report):
+    """Peaks 3, 9, 1 µJ in worlds 1, 2, 3, planned 0.5 µJ; the mean over worlds has no ratio of means."""
+    wanted = {"controller": DEFAULT, "case": "perfect", "guide": "with a guide"}
+    (found,) = [each.estimates for each in report.findings.groups if each.levels == wanted]
+    assert_allclose((found["peak_energy_uj"].value, found["peak_energy_ratio"].value), (3.0, 6.0))
+    assert "Energies are geometric means;" in Page(report.page).text
+    assert report.values()["statistics"]["energies"] == "geometric means"
 
 
 def test_predictions_are_reported_for_groups_that_have_any(report):

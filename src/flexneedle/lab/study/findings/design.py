@@ -125,10 +125,9 @@ def _read_column(rows: InsertionRows, key: str) -> list[Any]:
 def _read_guides(rows: InsertionRows) -> list[str]:
     """Return "with a guide" or "no guide" for each world (n,); "" in other studies."""
     guides = np.isnan(rows.number("setup.guide_to_skin_mm"))
-    of_worlds = not np.isnan(rows.number("world")).all()
-    return (
-        ["no guide" if without else "with a guide" for without in guides] if of_worlds else [""] * len(rows)
-    )
+    if not rows.has_worlds:
+        return [""] * len(rows)
+    return ["no guide" if without else "with a guide" for without in guides]
 
 
 def _make_factor(key: str, values: Sequence[Any], first: Sequence[Any] = ()) -> Factor:

@@ -20,7 +20,7 @@ from flexneedle.lab.study.findings.groups import (
 from flexneedle.lab.study.findings.predictions import Predictions, assess_predictions
 from flexneedle.lab.study.findings.reading import StudyTables
 from flexneedle.lab.study.findings.statistics import CONFIDENCE, RESAMPLES, SEED
-from flexneedle.lab.study.findings.worlds import WorldGroup, group_worlds, has_worlds
+from flexneedle.lab.study.findings.worlds import WorldGroup, group_worlds
 
 _MOST_KINDS = 20  # of endings in the list
 
@@ -62,6 +62,11 @@ class Findings:
         return max(0, self.planned - len(self.study.rows))
 
     @property
+    def energy_means(self) -> str:
+        """Name of the means of energies: E₁ of random worlds differs by orders of magnitude."""
+        return "geometric means" if self.study.rows.has_worlds else "means"
+
+    @property
     def hits(self) -> int:
         """Number of insertions that finished within 1 mm of the target."""
         return sum(group.known - group.missed for group in self.whole)
@@ -78,6 +83,7 @@ class Findings:
             "outcomes": dict(self.outcomes),
             "statistics": {
                 "over": "finished insertions",
+                "energies": self.energy_means,
                 "quantiles": "linear interpolation between order statistics",
                 "intervals": "percentile bootstrap, drawn by seed",
                 "confidence": CONFIDENCE,
@@ -113,7 +119,7 @@ def compute_findings(study: StudyTables) -> Findings:
         compare_controllers(rows, design),
         compare_cases(rows, design),
         count_endings(rows)[:_MOST_KINDS],
-        find_worst(rows, among=design.controller.codes == 0 if has_worlds(rows) else None),
+        find_worst(rows, among=design.controller.codes == 0 if rows.has_worlds else None),
         group_worlds(rows, design),
         assess_predictions(rows, design),
     )

@@ -12,8 +12,10 @@ from flexneedle.lab.study.findings.design import Factor, StudyDesign
 from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Codes, Flags, Floats, InsertionRows
 from flexneedle.lab.study.findings.statistics import (
     IntervalEstimate,
+    Statistic,
     bound_share_beyond,
     estimate_all,
+    geometric_mean,
     mean,
     quantile,
     ratio,
@@ -36,7 +38,7 @@ class SettingGroup:
     with a period that did not converge, finished or not; unconverged_periods: number of such periods; seeds: number of
     distinct seeds; largest_mm: largest true error; largest_period_ratio: largest number of periods relative to the
     plan; beyond_largest: upper bound (95 % confidence) on the share of all insertions beyond largest_mm; estimates: by
-    name, over finished insertions.
+    name, over finished insertions; energies of random worlds are geometric means.
     """
 
     name: str
@@ -58,8 +60,10 @@ class SettingGroup:
 class Difference:
     """Mean paired difference (mm) of true errors, `name` minus `against`, between insertions otherwise identical.
 
-    pairs: both finished; left_out: pairs with an unfinished insertion; verdict: "better" if the interval of the
-    difference is below 0, "worse" if above, otherwise "not separable"; None without an interval.
+    pairs: both finished; left_out: pairs with an unfinished insertion; peak_energy_ratio, mean_energy_ratio: geometric
+    means of `name` over `against` where both energies are positive; guide_travel_mm: mean difference of the travel in
+    the tissue; verdict: "better" if the interval of the error's difference is below 0, "worse" if above, otherwise "not
+    separable"; None without an interval.
     """
 
     name: str
@@ -68,6 +72,9 @@ class Difference:
     pairs: int
     left_out: int
     mean_mm: IntervalEstimate
+    peak_energy_ratio: IntervalEstimate
+    mean_energy_ratio: IntervalEstimate
+    guide_travel_mm: IntervalEstimate
     verdict: str | None
 
 
@@ -136,6 +143,7 @@ def _estimate_group(rows: InsertionRows, ended: Codes, seeds: Codes) -> dict[str
 
     error = column("true_error_mm")
     loads = {name: values[ended] for name, values in find_loads(rows).items()}
+    average, relate = (geometric_mean, _relate_each) if rows.has_worlds else (mean, ratio)
     statistics = {
         "mean_mm": mean(error),
         "sd_mm": sd(error),
@@ -144,9 +152,9 @@ def _estimate_group(rows: InsertionRows, ended: Codes, seeds: Codes) -> dict[str
         "residual_mm": mean(column("residual_mm")),
         "flips": mean(column("flips")),
         "planned_flips": mean(column("planned_flips")),
-        **{name: mean(values) for name, values in loads.items()},
+        **{name: average(values) for name, values in loads.items()},
         **{
-            f"{of}_energy_ratio": ratio(loads[f"{of}_energy_uj"], loads[f"planned_{of}_energy_uj"])
+            f"{of}_energy_ratio": relate(loads[f"{of}_energy_uj"], loads[f"planned_{of}_energy_uj"])
             for of in ENERGIES
         },
         **{
@@ -242,10 +250,23 @@ def _compare_sides(
     both = np.array([(one[key], other[key]) for key in one if key in other], dtype=np.int64).reshape(-1, 2)
     known = (done & ~np.isnan(error))[both].all(axis=1)
     pairs = both[known]
-    difference = error[pairs[:, 0]] - error[pairs[:, 1]]
-    found = estimate_all({"mean": mean(difference)}, _renumber(rows.codes("seed")[pairs[:, 0]]))["mean"]
+    (first, second), travel, loads = pairs.T, rows.number("guide_travel_mm"), find_loads(rows)
+    peak, average = loads["peak_energy_uj"], loads["mean_energy_uj"]
+    statistics = {
+        "mean_mm": mean(error[first] - error[second]),
+        "peak_energy_ratio": _relate_each(peak[first], peak[second]),
+        "mean_energy_ratio": _relate_each(average[first], average[second]),
+        "guide_travel_mm": mean(travel[first] - travel[second]),
+    }
+    found = estimate_all(statistics, _renumber(rows.codes("seed")[first]))
+    left_out, verdict = int((~known).sum()), _judge(found["mean_mm"])
     name, against, controller = names
-    return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _judge(found))
+    return Difference(name, against, controller, len(pairs), left_out, verdict=verdict, **found)
+
+
+def _relate_each(over: Floats, under: Floats) -> Statistic:
+    """Return the geometric mean of the ratios of two columns (n,)."""
+    return geometric_mean(divide_positive(over, under))
 
 
 def _judge(difference: IntervalEstimate) -> str | None:

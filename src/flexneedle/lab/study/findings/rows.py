@@ -30,6 +30,11 @@ class InsertionRows:
         """Names of the columns."""
         return tuple(self.table.column_names)
 
+    @property
+    def has_worlds(self) -> bool:
+        """Whether the insertions are into random worlds."""
+        return not np.isnan(self.number("world")).all()
+
     def number(self, name: str) -> Floats:
         """Return a column as floats (n,), NaN where unknown or not a number."""
         kind = self.table.schema.field(name).type if name in self.names else pa.null()

@@ -71,6 +71,12 @@ def quantile(values: Floats, share: float) -> Statistic:
     return statistic
 
 
+def geometric_mean(values: Floats) -> Statistic:
+    """Return the geometric mean of values (n,), ignoring NaN and values that are not positive."""
+    average = mean(np.log(np.where(values > 0.0, values, nan)))
+    return lambda counts: np.exp(average(counts))
+
+
 def ratio(over: Floats, under: Floats) -> Statistic:
     """Return the ratio of the means of two columns (n,) over the rows with both known."""
     both = np.isnan(over) | np.isnan(under)

@@ -36,7 +36,8 @@ class WorldGroup:
     Shares (0 to 1): above 1 mm; within max(0.1 mm, 2 × error of open loop in the same world), and within that error
     + 0.2 mm, if open loop finished; within the reach + 0.5 mm, if the reach is known.
     …_energy_ratio, …_energy_relative: geometric means of peak, mean and end of the energy of the true tissue, relative
-    to the plan and to E₁; travel of the guide in the tissue (mm): means. NaN: unknown.
+    to the plan and to E₁; peak_energy_uj: geometric mean of the peak (µJ); travel of the guide in the tissue (mm) and
+    rolls of the bevel: means; least_stretch: minimum. NaN: unknown.
     """
 
     levels: dict[str, str]
@@ -52,36 +53,33 @@ class WorldGroup:
     within_twice_open_loop: float
     within_open_loop: float
     within_reach: float
+    least_stretch: float
     peak_energy_ratio: float
     mean_energy_ratio: float
     end_energy_ratio: float
     peak_energy_relative: float
     mean_energy_relative: float
     end_energy_relative: float
+    peak_energy_uj: float
     guide_travel_mm: float
     planned_guide_travel_mm: float
-
-
-def has_worlds(rows: InsertionRows) -> bool:
-    """Return whether the study is a study of worlds."""
-    return not np.isnan(rows.number("world")).all()
+    flips: float
 
 
 def group_worlds(rows: InsertionRows, design: StudyDesign) -> list[WorldGroup]:
     """Return the groups of a study of worlds in the order of its factors; none for another study."""
-    if not has_worlds(rows):
+    if not rows.has_worlds:
         return []
     error = np.where(find_finished(rows), rows.number("true_error_mm"), nan)
-    columns = np.stack(
-        [error, _find_open_loop(rows, design, error), rows.number("reach_mm"), *_find_loads(rows)]
-    )
+    open_loop, known = _find_open_loop(rows, design, error), map(rows.number, ("reach_mm", "least_stretch"))
+    columns = np.stack([error, open_loop, *known, *_find_loads(rows)])
     failed = find_failures(rows)
     return [_make_group(levels, columns[:, own], failed[own]) for levels, own in split_rows(design.factors)]
 
 
 def _make_group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup:
-    """Return the group of columns (11, n): error, error of open loop, reach, and `_find_loads`."""
-    error, open_loop, reach, *loads = columns[:, ~np.isnan(columns[0])]
+    """Return the group of columns (14, n): error, error of open loop, reach, least stretch, `_find_loads`."""
+    error, open_loop, reach, stretch, *loads = columns[:, ~np.isnan(columns[0])]
     share = (0.5, 0.95, 0.99, 1.0)
     median, p95, p99, largest = np.quantile(error, share).tolist() if len(error) else [nan] * 4
     return WorldGroup(
@@ -98,8 +96,9 @@ def _make_group(levels: dict[str, str], columns: Floats, failed: Flags) -> World
         _share_within(error, np.maximum(LEAST_MM, TWICE * open_loop)),
         _share_within(error, open_loop + WORSE_MM),
         _share_within(error, reach + BEYOND_REACH_MM),
-        *(float(np.exp(average(np.log(energy[energy > 0.0])))) for energy in loads[:-2]),
-        *(average(travel[~np.isnan(travel)]) for travel in loads[-2:]),
+        float(np.min(stretch)) if len(stretch) else nan,
+        *(float(np.exp(average(np.log(energy[energy > 0.0])))) for energy in loads[:-3]),
+        *(average(effort[~np.isnan(effort)]) for effort in loads[-3:]),
     )
 
 
@@ -142,8 +141,9 @@ def find_failures(rows: InsertionRows) -> Flags:
 
 
 def _find_loads(rows: InsertionRows) -> list[Floats]:
-    """Return peak, mean and end of the energy (n,) relative to the plan, then to E₁; guide travel, planned travel."""
+    """Return loads (n,): energies relative to the plan, then to E₁; the peak; guide travel, planned travel, rolls."""
     found = find_loads(rows)
     ratios = [divide_positive(found[f"{of}_energy_uj"], found[f"planned_{of}_energy_uj"]) for of in ENERGIES]
     relative = [found[f"{of}_energy_relative"] for of in ENERGIES]
-    return [*ratios, *relative, rows.number("guide_travel_mm"), rows.number("planned_guide_travel_mm")]
+    effort = map(rows.number, ("guide_travel_mm", "planned_guide_travel_mm", "flips"))
+    return [*ratios, *relative, found["peak_energy_uj"], *effort]

@@ -71,9 +71,9 @@ def format_decimals(value: float, digits: int = 3, unit: str = "") -> str:
     return "–" if isnan(value) else f"{value:.{digits}f}{unit}"
 
 
-def format_signed(value: float) -> str:
+def format_signed(value: float, digits: int = 3) -> str:
     """Return a number with its sign as text."""
-    return "–" if isnan(value) else f"{value:+.3f}".replace("-", "−")
+    return "–" if isnan(value) else f"{value:+.{digits}f}".replace("-", "−")
 
 
 def format_interval(estimate: IntervalEstimate, digits: int = 3, unit: str = "") -> str:
