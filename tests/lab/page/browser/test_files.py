@@ -50,7 +50,7 @@ def test_a_scenario_is_begun_from_preset_world_and_file_and_saved_and_changes_ar
     page.click("[aria-label='Begin with the preset']")
     page.fill("[aria-label='Number of a random world']", "7")
     page.click("text=Random world")
-    assert [each["name"] for each in server.wait_for("preset", 2)] == ["phantom", "world:7"]
+    assert [each["name"] for each in server.wait_for("preset", 2)] == ["phantom", "wide:7"]
     page.set_input_files(f"{FILES} input[type=file]", payload("my ü.toml", TEXT.encode()))
     assert server.wait_for("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
     page.set_input_files(f"{FILES} input[type=file]", payload("large.toml", b"x" * 200_001))

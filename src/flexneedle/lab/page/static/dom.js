@@ -32,6 +32,9 @@ export function arrange(element, children) {
   });
 }
 
+// Format a number with three significant digits, as the command line does; "–" if it is unknown.
+export const brief = (value) => (Number.isFinite(value) ? String(Number(value.toPrecision(3))).replace("-", "−") : "–");
+
 // Format a number: digits after the point, with a true minus sign; "–" if it is unknown.
 export function shown(value, digits = 2) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";

@@ -49,7 +49,7 @@ function beginWorld(input, begins) {
   if (!Number.isInteger(number) || number < 0 || number > MOST_WORLDS) input.setAttribute("aria-invalid", "true");
   else {
     input.removeAttribute("aria-invalid");
-    begins(`world:${number}`);
+    begins(`wide:${number}`);
   }
 }
 

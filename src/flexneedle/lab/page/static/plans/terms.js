@@ -1,6 +1,6 @@
 // Table of plans: the weighted terms of the cost of each, its end, and its load on the tissue.
 
-import { make, shown } from "../dom.js";
+import { brief, make, shown } from "../dom.js";
 import { loadRows } from "../load.js";
 
 const ROWS = [
@@ -17,12 +17,12 @@ export function termsTable(plans) {
   const terms = names.map((name) => row(`Cost: ${name}`, ({ terms }) => barOf(terms[name], most)));
   const head = make("tr", {}, make("td"), ...plans.map(({ strategy }) => make("th.number", { scope: "col" }, strategy)));
   const caption = make("caption.spoken", {}, "Plans and the terms of their cost");
-  return [make("table", {}, caption, make("thead", {}, head), make("tbody", {}, ...terms, row("Cost", ({ cost }) => shown(cost, 3)), ...ROWS.map((each) => row(...each)), ...loadRows(plans.map(({ load }) => load))))];
+  return [make("table", {}, caption, make("thead", {}, head), make("tbody", {}, ...terms, row("Cost (mm)", ({ cost }) => brief(cost)), ...ROWS.map((each) => row(...each)), ...loadRows(plans.map(({ load }) => load))))];
 }
 
 // A number with a bar of that length.
 function barOf(value, most) {
   if (value === undefined) return "–";
   const bar = make("meter", { min: "0", max: String(most), value: String(value), "aria-hidden": "true" });
-  return make("span.bar", {}, bar, shown(value, 3));
+  return make("span.bar", {}, bar, brief(value));
 }
