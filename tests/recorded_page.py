@@ -167,7 +167,7 @@ def reach_frame():
 
 def load(energies, rolls):
     """Return the load of a plan or an insertion, as text by name."""
-    return {"tissue energy: peak, mean, end": f"{energies} µJ", "rolls": str(rolls)}
+    return {"tissue energy: peak, mean, end": f"{energies} µJ", "bevel rolls": str(rolls)}
 
 
 def plan(strategy="manipulation", **changes):
@@ -280,7 +280,7 @@ def planned():
             error_mm=2.1,
             cost=4.2,
             load=load("9, 4, 9", 2),
-            terms={"accuracy": 4.0, "flips": 0.2},
+            terms={"accuracy": 4.2, "flips": 9.98e-5},
         ),
         *plan_frames(FrameSource.STEERING, sway=-1.5),
         reach_frame(),

@@ -142,10 +142,10 @@ def test_a_plan_file_of_an_earlier_version_has_no_stretch():
 def test_all_values_are_in_the_rows():
     """In the order of the record."""
     load = Invasiveness(1234.5, 0.0123456, 3.0, 6.0, 0.95, 7.25, 4)
-    text = " ".join(load.rows("rolls").values())
+    text = " ".join(load.rows().values())
     for shown in ("1230, 0.0123, 3 µJ", "206, 0.00206, 0.5", "0.95", "7.25 mm", "4"):
         assert shown in text
-    assert load.rows("rolls") != replace(load, estimated=True).rows("rolls")
+    assert load.rows() != replace(load, estimated=True).rows()
 
 
 @pytest.mark.parametrize("name", ["phantom", "phantom3d"])

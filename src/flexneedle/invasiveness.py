@@ -91,8 +91,8 @@ class Invasiveness:
         peak, mean, end = map(format_number, self.energies_uj)
         return f"peak {peak}, mean {mean}, end {end} µJ"
 
-    def rows(self, turns: str = "rolls") -> dict[str, str]:
-        """Return the values as text by name, for tables; turns: name for rolls of the bevel."""
+    def rows(self) -> dict[str, str]:
+        """Return the values as text by name, for tables."""
         tissue = "estimated tissue" if self.estimated else "tissue"
         energies, relative = (
             ", ".join(map(format_number, values)) for values in (self.energies_uj, self.relative_energies)
@@ -102,7 +102,7 @@ class Invasiveness:
             "  relative to E₁": relative,
             f"least stretch of the {tissue}": format_number(self.least_stretch),
             "guide travel in the tissue": f"{self.guide_travel_mm:.2f} mm",
-            turns: str(self.rolls),
+            "bevel rolls": str(self.rolls),
         }
 
     def __str__(self) -> str:

@@ -162,7 +162,7 @@ class Plan:
 
     @property
     def flips(self) -> int:
-        """Number of rolls of the bevel (flips, in the plane) during the insertion, without the roll at the start."""
+        """Number of rolls of the bevel during the insertion, without the roll at the start."""
         return int(np.count_nonzero(self.controls[:, ROLL]))
 
     def __repr__(self) -> str:
@@ -278,7 +278,7 @@ class Insertion:
 
     @property
     def flips(self) -> int:
-        """Number of applied rolls of the bevel (bevel flips, in the plane)."""
+        """Number of applied rolls of the bevel."""
         return sum(period.applied.rolls for period in self.periods)
 
     @property

@@ -125,10 +125,10 @@ def test_paths_are_from_plan_and_record():
 
 def test_marks_of_rolls_show_side_and_position():
     (scene,), plan = axes(drawn("reached"), "scene"), INSERTION.plan
-    (planned,) = lines(scene, "bevel flip, planned")
+    (planned,) = lines(scene, "bevel roll, planned")
     assert (planned.get_marker(), planned.get_markerfacecolor()) == ("v", "none")  # from +1 to −1
     assert planned.get_xdata()[0] == plan.tips[45, 0]
-    applied = lines(scene, "bevel flip, applied")
+    applied = lines(scene, "bevel roll, applied")
     assert [line.get_marker() for line in applied] == ["v", "^", "v"]
     assert applied[0].get_xdata()[0] == INSERTION.periods[40].estimate.x
     assert applied[0].get_ydata()[0] < INSERTION.periods[40].estimate.y
@@ -166,15 +166,15 @@ def test_a_miss_is_drawn_at_the_end():
     ("case", "missing"),
     [
         ("reached", {"tracker, rejected"}),
-        ("one period", {"tracker, rejected", *PATHS, "bevel flip, applied", "earlier shapes"}),
-        ("held from the start", {"tracker", *PATHS, "bevel flip, applied"}),
-        ("without rolls", {"tracker, rejected", "bevel flip, planned", "bevel flip, applied"}),
+        ("one period", {"tracker, rejected", *PATHS, "bevel roll, applied", "earlier shapes"}),
+        ("held from the start", {"tracker", *PATHS, "bevel roll, applied"}),
+        ("without rolls", {"tracker, rejected", "bevel roll, planned", "bevel roll, applied"}),
     ],
 )
 def test_the_legend_names_all_that_is_drawn_and_nothing_else(case, missing):
     known = ["estimated needle", "planned path", "bevel at the start", "target, circle of 1 mm radius"]
     known += ["earlier shapes", "true path", "estimated path", "tracker", "tracker, rejected"]
-    known += ["bevel flip, planned", "bevel flip, applied", "guide travel"]
+    known += ["bevel roll, planned", "bevel roll, applied", "guide travel"]
     (legend,) = drawn(case).legends
     assert sorted(names(legend)) == sorted(set(known) - missing)
 

@@ -151,10 +151,10 @@ def test_panels_show_both_axes_and_the_angle_of_the_needle():
     assert roll.get_title(loc="left") == "Roll of the needle (°)"
 
 
-def test_a_guide_of_one_axis_has_one_line_and_half_turns_are_named_flips():
+def test_a_guide_of_one_axis_has_one_line_and_rolls_are_counted():
     assert names(axes(drawn("half turns"), "motion")[0].get_legend()) == ["planned y", "applied y"]
     assert "bevel rolls: 3 (planned 1)" in "\n".join(texts(drawn("reached")))
-    assert "bevel flips: 0 (planned 1)" in "\n".join(texts(drawn("half turns")))
+    assert "bevel rolls: 0 (planned 1)" in "\n".join(texts(drawn("half turns")))
 
 
 @unarranged()

@@ -46,7 +46,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("  measured", _number(result["residual_mm"], "mm")),
         ("  planned", _number(result["planned_error_mm"], "mm")),
         *_registration(scenario, insertion),
-        *_invasiveness(scenario, insertion),
+        *_invasiveness(insertion),
         ("control periods", str(result["steps"])),
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         *([("late decisions", str(insertion.late))] if insertion.late else []),
@@ -84,10 +84,9 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
     return [("  expected registration error", _number(error, "mm"))]
 
 
-def _invasiveness(scenario: Scenario, insertion: Insertion) -> Iterator[tuple[str, str]]:
+def _invasiveness(insertion: Insertion) -> Iterator[tuple[str, str]]:
     """Yield the rows of the load on the tissue, each followed by the plan's."""
-    turns = scenario.setup.turns
-    done, planned = insertion.invasiveness.rows(turns), insertion.plan.invasiveness.rows(turns)
+    done, planned = insertion.invasiveness.rows(), insertion.plan.invasiveness.rows()
     for (name, value), plan in zip(done.items(), planned.values(), strict=True):
         yield from ((name, value), ("  planned", plan))
 

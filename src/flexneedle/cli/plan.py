@@ -87,7 +87,7 @@ def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:
         **dict([target_row(scenario, plan.target), *entry_rows(scenario, plan)]),
         "planned tip to target": format_mm(plan.error_mm),
         f"entry angle{'s' if scenario.setup.axes > 1 else ''}": "none" if isnan(plan.entry_angle) else angles,
-        **plan.invasiveness.rows(scenario.setup.turns),
+        **plan.invasiveness.rows(),
         "cost (mm)": f"{plan.cost:.3g}",
         **{f"  {name}": f"{value:.3g}" for name, value in plan.terms.items()},
         "iterations": f"{plan.iterations}, {'converged' if plan.converged else 'not converged'}",

@@ -44,7 +44,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         draw_depths([axes[name] for name in shown], scenario, list(shown.values()))
         for end, view in sections.items():
             _close_up(axes[f"end{end}"], scenario, insertion, view)
-        facts = _facts(scenario, insertion)
+        facts = _facts(insertion)
         if not is_column():
             axes[f"end{end}"].set_xlabel("\n".join(facts))
         if len(field):
@@ -103,7 +103,7 @@ def _rolls(ax: Axes, scenario: Scenario, insertion: Insertion, view: View, lengt
     space.draw_planned(ax, scenario, insertion.plan, view, length)
     applied = curves.applied_rolls(insertion)
     if scenario.setup.axes == 1:
-        scene.draw_rolls(ax, applied, ESTIMATE, solid=True, label="bevel flip, applied")
+        scene.draw_rolls(ax, applied, ESTIMATE, solid=True, label="bevel roll, applied")
     else:
         label = "bevel after a roll, applied"
         space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=label)
@@ -247,14 +247,14 @@ def _known_path(insertion: Insertion) -> Floats:
     return truth if len(truth) else curves.estimated_path(insertion)
 
 
-def _facts(scenario: Scenario, insertion: Insertion) -> list[str]:
-    """Return errors, bevel flips or rolls, controller and phantom, as far as they are known."""
+def _facts(insertion: Insertion) -> list[str]:
+    """Return errors, bevel rolls, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     errors = [f"{name} {format_mm(value)}" for name, value in values if not np.isnan(value)]
-    flips = f"{scenario.setup.turns}: {insertion.flips} (planned {insertion.plan.flips})"
+    rolls = f"bevel rolls: {insertion.flips} (planned {insertion.plan.flips})"
     phantom = f"{insertion.phantom.rpartition(':')[2]} phantom" if insertion.phantom else ""
     return [
         *errors,
-        flips,
+        rolls,
         ", ".join(filter(None, (insertion.controller_name or insertion.controller, phantom))),
     ]

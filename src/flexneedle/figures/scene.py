@@ -1,4 +1,4 @@
-"""The scene to scale: tissue, guide, needle, target, bevel flips. The legend names the artists by their labels.
+"""The scene to scale: tissue, guide, needle, target, bevel rolls. The legend names the artists by their labels.
 
 A view is the pair of coordinates that are drawn: depth and y, and in space depth and z, or z and y along the axis.
 """

@@ -57,7 +57,7 @@ def draw_planned(ax: Axes, scenario: Scenario, plan: Plan, view: View, length: f
     planned = planned_rolls(plan)
     if scenario.setup.axes == 1:
         scene.draw_rolls(ax, [start_roll(plan)], QUIET, solid=True, label="bevel at the start")
-        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel flip, planned")
+        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel roll, planned")
     else:
         start = [start_roll(plan)]
         draw_bevels(ax, start, view, length, QUIET, solid=True, label="bevel at the start")

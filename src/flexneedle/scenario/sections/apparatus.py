@@ -78,11 +78,6 @@ class Setup(Section):
         return 'setup.rotation = "half-turns"' if self.half_turns else ""
 
     @property
-    def turns(self) -> str:
-        """Name for rolls of the bevel: flips in the plane."""
-        return "bevel flips" if self.half_turns else "bevel rolls"
-
-    @property
     def max_rotation(self) -> float:
         """Largest angle of the needle from its angle 0, to either side, rad."""
         return inf if self.max_rotation_deg is None else radians(self.max_rotation_deg)

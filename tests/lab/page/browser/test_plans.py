@@ -141,10 +141,11 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
     arrived(page)
     page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
     cells = table(page)
-    assert cells["Cost: accuracy"] == ["0.020", "4.000"]
-    assert cells["Cost: energy"] == ["0.120", "–"]
-    assert cells["Cost"] == ["0.190", "4.200"]
-    assert cells["rolls"] == ["0", "2"]
+    assert cells["Cost: accuracy"] == ["0.02", "4.2"]
+    assert cells["Cost: energy"] == ["0.12", "–"]
+    assert cells["Cost: flips"] == ["0.05", "0.0000998"]
+    assert cells["Cost (mm)"] == ["0.19", "4.2"]
+    assert cells["bevel rolls"] == ["0", "2"]
     assert cells["tissue energy: peak, mean, end"] == ["3.2, 1.1, 2.1 µJ", "9, 4, 9 µJ"]
     page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLANS} .sweeps figcaption:has-text('steering, lateral ×')")

@@ -189,7 +189,7 @@ def _base_turn_problems(scenario: Scenario, strategy: str) -> Iterator[Problem]:
 def _rotation_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
     setup, axis = scenario.setup, rig.axes.rotation
     if axis is None:
-        yield Problem("axes.rotation", None, f"missing: the needle is rolled ({setup.turns})")
+        yield Problem("axes.rotation", None, "missing: the needle is rolled")
         return
     low, high = axis.range_deg
     shown = f"axes.rotation.range_deg is {low:g} to {high:g}"
