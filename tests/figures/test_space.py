@@ -162,7 +162,7 @@ def test_a_needle_without_a_guide_shows_its_base_where_it_is_mounted():
     """The planned base is off the x axis where the needle enters elsewhere, as is the applied one."""
     assert "Base, lateral (mm)" in texts(drawn("no guide"))
     assert "guide" not in texts(drawn("no guide"))
-    (base,) = lines(*axes(drawn("no guide"), "motion"), "applied z")
+    (base,) = lines(*axes(drawn("no guide"), "motion"), "estimated z")
     np.testing.assert_array_equal(base.get_ydata(), [period.base.z for period in INSERTION.periods])
     entered = replace(INSERTION.plan, shapes=INSERTION.plan.shapes + np.array([0.0, -1.5, 2.5, 0.0, 0.0]))
     figure = insertion_figure(NO_GUIDE, replace(INSERTION, plan=entered))

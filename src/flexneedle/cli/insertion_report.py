@@ -39,7 +39,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     rows = [
         ("controller", insertion.controller_name or insertion.controller),
-        _needle(insertion),
+        _needle(scenario, insertion),
         target_row(scenario, insertion.target),
         *entry_rows(scenario, insertion.plan),
         ("true tip to target", _number(result["true_error_mm"], "mm")),
@@ -58,10 +58,10 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     print(f"Record and figures: {folder}")
 
 
-def _needle(insertion: Insertion) -> tuple[str, str]:
+def _needle(scenario: Scenario, insertion: Insertion) -> tuple[str, str]:
     """Return the row of the phantom, or of the rig."""
     if not insertion.rig:
-        mismatch = insertion.plan.scenario.phantom.structure.model_dump(exclude_defaults=True)
+        mismatch = scenario.phantom.structure.model_dump(exclude_defaults=True)
         return "phantom", ", ".join([insertion.phantom, *mismatch])
     return "rig", f"{insertion.rig}{', not moved; virtual needle' if insertion.dry_run else ''}"
 

@@ -170,7 +170,9 @@ def _motion(scenario: Scenario, insertion: Insertion) -> DepthPanel:
         planned = curves.planned_motion(plan, guided, axis)
         applied = curves.applied_motion(insertion, guided, axis)
         lines.append(Line(f"planned{end}", plan.tips[:, X], planned, tone(PLAN, axis), "--"))
-        lines.append(Line(f"{'applied' if guided else 'estimated'}{end}", depth, applied, tone(ESTIMATE, axis)))
+        lines.append(
+            Line(f"{'applied' if guided else 'estimated'}{end}", depth, applied, tone(ESTIMATE, axis))
+        )
     return DepthPanel("Guide, lateral (mm)" if guided else "Base, lateral (mm)", lines, 0.4)
 
 
