@@ -15,7 +15,7 @@ PHANTOM = flexneedle.load_scenario("phantom")
 QUICK = PHANTOM.with_values(
     {
         f"control.adaptive_mpc.{key}": value
-        for key, value in (("samples", 12), ("iterations", 1), ("effort", 1))
+        for key, value in (("paths", 12), ("unguided_iterations", 1), ("effort", 1))
     }
 )
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
