@@ -21,7 +21,7 @@ PHANTOM = load_scenario("phantom")
         ("needle.bevel.offset_mm", 0.0004, "25 times below"),
         ("needle.bevel.length_mm", 100.0, "5.26 times the largest"),
         ("tissue.0.shear_modulus_kpa", 0.002, "300 times below"),
-        ("tissue.1.shear_modulus_kpa", 6000.0, "8.82 times the largest"),
+        ("tissue.1.shear_modulus_kpa", 6000.0, "28.6 times the largest"),
         ("tissue.0.alpha", -0.3, "6.67 times below the smallest usual value, 2 to 40 (in size: "),
         ("tissue.0.compression_length_mm", 2000.0, "20 times the largest"),
         ("tissue.0.engaged_width_mm", 0.0052, "231 times below"),

@@ -49,9 +49,7 @@ USUAL = {
         "epidermis 0.075 (doi:10.1016/j.burns.2016.11.014); 200, the length of needles, is our estimate",
     ),
     "tissue.*.shear_modulus_kpa": Range(
-        0.6,
-        680,
-        "stomach 0.64, liver 1.8, gallbladder 85, artery 210 (doi:10.1088/1361-6560/ab5010), gels to 680 (preset gel)",
+        0.6, 210, "stomach 0.64, liver 1.8, gallbladder 85, artery 210 (doi:10.1088/1361-6560/ab5010)"
     ),
     "tissue.*.alpha": _ALPHA,
     "tissue.*.compression_length_mm": Range(
