@@ -358,6 +358,11 @@ def test_a_force_of_the_guide_is_charged_if_it_has_a_limit():
     assert not coarse({"guard.guide_force_n": 0.5 * force}).refusal
 
 
+def test_the_tolerance_of_a_plan_is_a_spread_in_mm():
+    search = planner._search_settings(PHANTOM.with_values({"plan.tolerance_mm": 0.02}).plan, 64)
+    assert search.tolerance * search.scale == 0.02
+
+
 def test_a_plan_that_two_searches_miss_is_made_of_rolls_alone(monkeypatch):
     """Of the three plans the one of least cost as carried out is kept, though its search cost more."""
     found, carry_out = [], planner._carry_out
