@@ -89,7 +89,7 @@ def make_periods(plan, miss=0.06, seed=0):
             action=Action.MOVE, decision="turn" if flip else "nearer path",
             true_tip=true, true_strain_energy=plan.strain_energy[k + 1] * 1.25,
             true_stretch=float(1.0 - 0.17 * inside**2),
-            true_shape=plan.shapes[k + 1, :, :3] + [0.0, off, 0.0],
+            true_shape=plan.shapes[k + 1, :, :3] + [0.0, off, 0.0], energy_scale=0.04,
             durations={"observe": 0.001, "decide": 0.004, "total": 0.0051 + 1e-5 * k},
         )  # fmt: skip
 

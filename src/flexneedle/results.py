@@ -226,6 +226,7 @@ class Period:
     true_shape: Floats | None = None  # points x, y, z (n, 3) at equal distances along the needle (mm)
     readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
     late: bool = False  # whether the decision came after the deadline, so that the needle rested
+    energy_scale: float = math.nan  # E₁ (mJ): see `Scenario.energy_scale`
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"

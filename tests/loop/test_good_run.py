@@ -55,6 +55,7 @@ def test_record_is_complete_for_every_period(plan, real):
         assert period.path.x == pytest.approx(on_plan, abs=0.02)
         assert period.true_stretch <= 1.0
         assert period.true_strain_energy >= 0.0
+        assert 1e3 * period.energy_scale == done.invasiveness.energy_scale_uj > 0.0
         assert np.isfinite([*period.estimate, *period.base, *period.true_tip, *period.tip_load]).all()
         assert period.durations.keys() == {"decide", "apply", "observe", "total"}
         parts = period.durations["decide"] + period.durations["observe"]

@@ -163,12 +163,11 @@ def test_a_text_that_is_not_a_verdict_is_rejected(text):
         parse_verdict(text)
 
 
-def test_a_row_of_an_earlier_version_has_no_stretch_of_the_estimate():
-    """It is restored as unknown."""
+def test_columns_that_a_row_of_an_earlier_version_lacks_are_restored_as_unknown():
     row = to_row(PERIODS[0])
-    del row["stretch"]
+    del row["stretch"], row["energy_scale_mj"]
     restored = from_row(row, PERIODS[0].shape, {})
-    assert np.isnan(restored.stretch)
+    assert np.isnan([restored.stretch, restored.energy_scale]).all()
     assert restored.strain_energy == PERIODS[0].strain_energy
 
 
@@ -207,6 +206,8 @@ def test_rosbags_reads_types_units_and_frame(trace_file):
     assert estimate.pose.position.y == pytest.approx(last.estimate.y * 1e-3, rel=1e-15)
     assert 2 * estimate.pose.orientation.z == pytest.approx(last.estimate.theta, rel=1e-3)
     assert found["/tissue/true_strain_energy"][1].data == last.true_strain_energy * 1e-3
+    assert found["/tissue/relative_energy"][1].data == last.strain_energy / 0.04
+    assert found["/tissue/true_relative_energy"][1].data == last.true_strain_energy / 0.04
     command = found["/command"][1]
     assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command.db_x * 1e-3
     assert len(found["/needle/shape"][1].poses) == len(last.shape)

@@ -23,7 +23,7 @@ from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Steering, Step
 from flexneedle.ports import Driver
-from flexneedle.results import Action, Insertion, Outcome, Period, Plan, format_mm
+from flexneedle.results import Action, Insertion, Outcome, Period, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import ROUNDING_S, travel_time
 from flexneedle.types import STILL, UNKNOWN, Control, Lateral, Motion, Pose, X
@@ -94,7 +94,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
     if (first := _first_step(state)) is not None:
         clocks, observation = [start, start, start, time.perf_counter()], state.observation
         yield (
-            _make_period(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks),
+            _make_period(next(indices), rig.clock.now(), task, rig, first, STILL, observation, clocks),
             None,
         )
     for index in indices:
@@ -115,7 +115,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
             decided, step = decided.hold_back(motion.held, state), step.hold_back(motion.held)
         state = _advance(decided, step, observation, steering, begun, now)
         ending = _ending(task, state)
-        period = _make_period(index, now, task.plan, rig, step, motion.control, observation, clocks)
+        period = _make_period(index, now, task, rig, step, motion.control, observation, clocks)
         yield replace(period, warning=warn_of_miss(step.decision, state.in_a_row)), ending
         if ending is not None:
             return
@@ -206,7 +206,7 @@ def _hold_ending(scenario: Scenario, state: LoopState) -> _Ending | None:
 def _make_period(
     index: int,
     now: float,
-    plan: Plan,
+    task: Task,
     rig: Rig,
     step: Step,
     applied: Control,
@@ -217,7 +217,7 @@ def _make_period(
 
     clocks: wall clock (s) at its start and after decision, motion and measurement.
     """
-    estimate = observation.estimate
+    plan, estimate = task.plan, observation.estimate
     state, truth = estimate.state, None if rig.truth is None else rig.truth()
     return Period(
         index=index,
@@ -234,6 +234,7 @@ def _make_period(
         guide=state.guide,
         roll=state.roll,
         strain_energy=state.strain_energy,
+        energy_scale=task.scenario.energy_scale(plan.target[X]),
         tip_load=state.tip_load,
         path=Pose.of(np.interp(estimate.tip[X], plan.tips[:, X], column) for column in plan.tips.T),
         cost=step.decision.cost,

@@ -124,6 +124,11 @@ def _largest_indicator(period: Period, _plan: Plan) -> float | None:
     return max(references, default=medians.get(TIP))
 
 
+def _relative(energy: float | None, period: Period) -> Message | None:
+    """Return an energy (mJ) over E₁; None if one of them is unknown, and for a target above all tissue."""
+    return number(energy / period.energy_scale) if energy is not None and period.energy_scale > 0.0 else None
+
+
 def _joint_states(period: Period) -> Message:
     return joints(period.time, (*period.base, *period.guide, period.roll))
 
@@ -229,6 +234,13 @@ FIELDS: dict[str, PeriodField] = {
             lambda one, _: None if one.true_strain_energy is None else 1e3 * one.true_strain_energy,
         ),
     ),
+    "energy_scale": PeriodField(
+        _numbers("energy_scale_mj"),
+        topics=(
+            Topic("/tissue/relative_energy", _NUMBER, lambda one: _relative(one.strain_energy, one)),
+            Topic("/tissue/true_relative_energy", _NUMBER, lambda one: _relative(one.true_strain_energy, one)),
+        ),
+    ),
     "stretch": PeriodField(_numbers("stretch")),
     "true_stretch": PeriodField(_numbers("true_stretch")),
     "converged": PeriodField((("converged", _flag),)),
@@ -238,7 +250,7 @@ FIELDS: dict[str, PeriodField] = {
 """Fields of `Period` by name, in the order of the columns. `true_…` are of the virtual phantom, which no controller
 knows. `record.topics` has durations and readings."""
 
-_ADDED = {"stretch": "nan"}  # columns that older traces lack
+_ADDED = {"stretch": "nan", "energy_scale_mj": "nan"}  # columns that older traces lack
 
 COLUMNS: tuple[str, ...] = tuple(name for field in FIELDS.values() for name, _ in field.columns)
 """Names of the columns, in order."""
