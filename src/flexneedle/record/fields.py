@@ -238,7 +238,9 @@ FIELDS: dict[str, PeriodField] = {
         _numbers("energy_scale_mj"),
         topics=(
             Topic("/tissue/relative_energy", _NUMBER, lambda one: _relative(one.strain_energy, one)),
-            Topic("/tissue/true_relative_energy", _NUMBER, lambda one: _relative(one.true_strain_energy, one)),
+            Topic(
+                "/tissue/true_relative_energy", _NUMBER, lambda one: _relative(one.true_strain_energy, one)
+            ),
         ),
     ),
     "stretch": PeriodField(_numbers("stretch")),
