@@ -98,7 +98,7 @@ RULES = [
     ("name", "two\nlines", "must be one line of printable text"),
     ("name", "x" * 201, "must have at most 200 characters"),
     ("phantom.bevel_factor", 1.0, "must be a list"),
-    ("plan.own_terms", {"term": "a:B"}, "must be a list: write [[plan.own_terms]]"),
+    ("plan.terms", {"term": "a:B"}, "must be a list: write [[plan.terms]]"),
     ("phantom.bevel_factor", [1.0, 2.0, 3.0], "must be two numbers"),
     ("phantom.bevel_factor[1]", True, NUMBER),
     # not finite

@@ -59,7 +59,7 @@ def test_all_defaults_are_filled_in_and_nothing_else_changes():
     for name, controller in CONTROLLERS.items():
         if controller.settings is not None:
             own = full.control.tables[controller.table]
-            assert set(own) == set(controller.settings.model_fields) - {"own_terms"}, name
+            assert set(own) == set(controller.settings.model_fields) - {"terms"}, name
     assert full.control.tables["my_pid"] == {"gain": 0.5}
     assert full.control.tables["bevel_only"] == {
         **CONTROLLERS["bevel-only"].settings().model_dump(),

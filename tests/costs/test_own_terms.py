@@ -14,7 +14,6 @@ from flexneedle.errors import InputError, ScenarioError
 from flexneedle.types import DG_Y
 
 # Without another test's warning (tests/scenario/test_old_weights.py).
-pytestmark = pytest.mark.filterwarnings("ignore:plan.own_terms. the cost of a plan is in mm now")
 SMALL = {"plan.samples": 32, "plan.iterations": 2, "plan.max_iterations": 2}
 
 
@@ -37,7 +36,7 @@ def module(monkeypatch):
 
 def with_terms(*terms, section="plan", **changes):
     listed = [{"term": term, "weight": weight} for term, weight in terms]
-    return flexneedle.load_scenario("phantom").with_values({f"{section}.own_terms": listed} | SMALL | changes)
+    return flexneedle.load_scenario("phantom").with_values({f"{section}.terms": listed} | SMALL | changes)
 
 
 @pytest.mark.usefixtures("module")
@@ -46,7 +45,7 @@ def test_a_plan_charges_a_term_by_name_and_passes_the_target_to_one_that_takes_i
     plan = flexneedle.plan(scenario, threads=1)
     assert plan.terms.keys() >= {"own_costs:guide_speed", "own_costs:depth_left"}
     assert plan.cost == pytest.approx(sum(plan.terms.values()), rel=1e-6)
-    free = flexneedle.plan(scenario.with_values({"plan.own_terms": None}), threads=1)
+    free = flexneedle.plan(scenario.with_values({"plan.terms": None}), threads=1)
     assert np.abs(plan.controls[:, DG_Y]).sum() < np.abs(free.controls[:, DG_Y]).sum()
     assert "own_costs:guide_speed" not in free.terms
 
@@ -57,14 +56,14 @@ def test_a_function_is_recorded_by_its_name(module, monkeypatch, section):
     values = with_terms((module.guide_speed, 0.5), section=section).values()
     for key in section.split("."):
         values = values[key]
-    assert values["own_terms"][0]["term"] == "own_costs:guide_speed"
+    assert values["terms"][0]["term"] == "own_costs:guide_speed"
 
 
 @pytest.mark.usefixtures("module")
 def test_controllers_charge_it_too():
     scenario = with_terms(("own_costs:guide_speed", 3.0), section="control.ce_mpc")
     settings = check_tables(scenario).control.tables["ce_mpc"]
-    assert settings["own_terms"][0]["weight"] == 3.0
+    assert settings["terms"][0]["weight"] == 3.0
     names = [weight.name for _, weight in CE_MPC.rows()]
     assert names == ["deviation", "guide", "energy"]
 
@@ -78,7 +77,7 @@ def test_anything_but_a_function_of_trajectories_is_refused(module, wrong):
     module.wrong = wrong
     with pytest.raises(ScenarioError) as caught:
         with_terms(("own_costs:wrong", 1.0))
-    assert caught.value.problems[0].startswith("plan.own_terms[0].term")
+    assert caught.value.problems[0].startswith("plan.terms[0].term")
 
 
 @pytest.mark.parametrize("name", ["guide_speed", "own_costs:none", "no_such_module:term"])
@@ -86,7 +85,7 @@ def test_anything_but_a_function_of_trajectories_is_refused(module, wrong):
 def test_a_name_that_cannot_be_found_is_refused(name):
     with pytest.raises(ScenarioError) as caught:
         with_terms((name, 1.0))
-    assert caught.value.problems[0].startswith("plan.own_terms[0].term")
+    assert caught.value.problems[0].startswith("plan.terms[0].term")
 
 
 def zero_controls(trajectories):

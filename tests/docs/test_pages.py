@@ -50,7 +50,6 @@ def folder(tmp_path, monkeypatch):
             del sys.modules[name]
 
 
-@pytest.mark.filterwarnings("ignore:plan.own_terms")
 @pytest.mark.parametrize("name", [marked(name) for name in EXAMPLES])
 def test_examples_run_and_print_what_the_page_shows(name, folder):
     differences = [

@@ -1,4 +1,4 @@
-"""Keys of earlier plans and controllers: dropped or reported, never silently of another meaning."""
+"""Keys of earlier plans and controllers: dropped with a warning, never silently of another meaning."""
 
 import pytest
 
@@ -65,14 +65,11 @@ def test_old_sizes_of_a_search_are_dropped_with_a_warning():
         assert with_controller_defaults(given) == with_controller_defaults(PHANTOM)
 
 
-def charge_nothing(trajectories):
-    return 0.0 * trajectories.energy[:, 0]
-
-
-def test_the_weights_of_own_terms_are_reported():
-    listed = [{"term": charge_nothing, "weight": 1.0}]
+@pytest.mark.parametrize("section", ["plan", "control.ce_mpc", "control.adaptive_mpc"])
+def test_terms_under_their_old_name_are_dropped_with_a_warning(section):
+    listed = [{"term": "flexneedle.costs.terms:travel", "weight": 1.0}]
     with pytest.warns(
-        ScenarioWarning, match=r"^plan\.own_terms: .* in mm now; divide weights of an older scenario by 20"
+        ScenarioWarning, match=rf"^{section}\.own_terms: not used, .* \[\[{section}\.terms\]\] now"
     ):
-        made = PHANTOM.with_values({"plan.own_terms": listed})
-    assert made.plan.own_terms[0].weight == 1.0
+        made = with_controller_defaults(PHANTOM.with_values({f"{section}.own_terms": listed}))
+    assert made == with_controller_defaults(PHANTOM)

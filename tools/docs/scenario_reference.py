@@ -71,13 +71,13 @@ def wrap(introduction: str, sections: str) -> str:
 
 def heading(table: Table) -> str:
     """Return the heading of a section."""
-    name = f"[[{table.name}]]" if table.name.endswith(("tissue", "own_terms")) else f"[{table.name}]"
+    name = f"[[{table.name}]]" if table.name.endswith(("tissue", "terms")) else f"[{table.name}]"
     return f"## `{name}`" if table.name else "## Top level"
 
 
 def _repeats(table: Table) -> bool:
-    """Return whether `[[plan.own_terms]]` has the same keys."""
-    return table.name.startswith("control.") and table.name.endswith(".own_terms")
+    """Return whether `[[plan.terms]]` has the same keys."""
+    return table.name.startswith("control.") and table.name.endswith(".terms")
 
 
 def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:

@@ -25,7 +25,7 @@ _TOLERANCE = 1e-3  # spread of the elite's costs at convergence, relative to the
 _LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 
 
-@with_weights(CE_MPC)
+@with_weights(CE_MPC, "control.ce_mpc")
 class CeMpc(BevelRule):
     """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule for the bevel."""
 

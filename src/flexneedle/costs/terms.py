@@ -15,8 +15,8 @@ one number for each sequence, (N,). It gets its further arguments by name from t
 `target` (x, y, z in mm); the others are those that the functions below take.
 
 A term outside of the package is a function of `trajectories`, or of `trajectories` and `target`. It is listed in a
-scenario with its weight, as `[[plan.own_terms]]`, `[[control.ce_mpc.own_terms]]` or
-`[[control.adaptive_mpc.own_terms]]`: `term = "module:NAME"`, `weight = 0.5`.
+scenario with its weight, as `[[plan.terms]]`, `[[control.ce_mpc.terms]]` or
+`[[control.adaptive_mpc.terms]]`: `term = "module:NAME"`, `weight = 0.5`.
 
 The terms with sums over steps are from the paper (eq. 13) and depend on the length of a step.
 """

@@ -187,7 +187,7 @@ class Cost:
     def terms(
         self, settings: Any, weights: Mapping[str, float] | None = None, **values: Any
     ) -> tuple[Term, ...]:
-        """Return the terms of this cost, with the user's terms (`settings.own_terms`) last.
+        """Return the terms of this cost, with the user's terms (`settings.terms`) last.
 
         weights: by the names of the terms (default: as in the settings); values: arguments of the functions by name,
         each passed to every function that takes it.
@@ -199,7 +199,7 @@ class Cost:
         ]
         own = [
             Term(each.term, each.weight, _check_values(each.term, CostTerm(each.function).bind(values)), _OWN)
-            for each in settings.own_terms or ()
+            for each in settings.terms or ()
         ]
         return *found, *own
 

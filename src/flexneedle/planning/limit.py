@@ -90,8 +90,8 @@ def _limit_of_search(settings: Any, terms: Mapping[str, float]) -> str:
     one_roll = PLAN.weights(settings)["flips"]  # that the plan may lack
     charged = {**terms, "flips": max(terms["flips"], one_roll)}
     largest = max(charged, key=lambda name: charged[name])
-    if largest in (term.term for term in settings.own_terms or ()):
-        return f"plan.own_terms ({largest} costs more than the miss)"
+    if largest in (term.term for term in settings.terms or ()):
+        return f"plan.terms ({largest} costs more than the miss)"
     if key := next((weight.key for _, weight in PLAN.rows() if weight.name == largest), ""):
         return f"plan.{key} = {getattr(settings, key):g} (costs more than the miss)"
     return f"plan.samples = {settings.samples} (the search found no better plan)"

@@ -68,25 +68,24 @@ NAMED = [  # settings of a study, modules that it names
     ('scenario = "own.toml"', ["fung"]),
     (TERMS, ["tilt"]),
     (
-        'scenario = "terms.toml"\nvalues = { plan.own_terms.0.term = "mine_costs:cost" }',
+        'scenario = "terms.toml"\nvalues = { plan.terms.0.term = "mine_costs:cost" }',
         ["mine_costs", "tilt"],
     ),
     (
-        'scenario = "terms.toml"\n[[axes]]\nkey = "plan.own_terms.0.term"\nvalues = ["mine_costs:cost"]',
+        'scenario = "terms.toml"\n[[axes]]\nkey = "plan.terms.0.term"\nvalues = ["mine_costs:cost"]',
         ["mine_costs", "tilt"],
     ),
     ('scenario = "terms_of_control.toml"', ["tilt"]),
 ]
 
 
-@pytest.mark.filterwarnings("ignore:plan.own_terms. the cost of a plan is in mm now")
 @pytest.mark.parametrize(("settings", "modules"), NAMED)
 def test_the_modules_of_all_custom_parts_are_recorded(here, settings, modules):
     preset = (Path(flexneedle.__file__).parent / "scenario" / "presets" / "phantom.toml").read_text()
     (here / "own.toml").write_text(preset.replace("alpha = ", 'law = "fung:Fung"\nexponent = ', 1))
     term = 'term = "tilt:largest_slope"\nweight = 1.0'
-    (here / "terms.toml").write_text(f"{preset}\n[[plan.own_terms]]\n{term}")
-    (here / "terms_of_control.toml").write_text(f"{preset}\n[[control.adaptive_mpc.own_terms]]\n{term}")
+    (here / "terms.toml").write_text(f"{preset}\n[[plan.terms]]\n{term}")
+    (here / "terms_of_control.toml").write_text(f"{preset}\n[[control.adaptive_mpc.terms]]\n{term}")
     (here / "mine_costs.py").write_text("from tilt import largest_slope as cost")
     study = load(f'name = "mine"\n{settings}')
     assert list(study.definition["own"]) == modules

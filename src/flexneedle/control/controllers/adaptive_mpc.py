@@ -68,7 +68,7 @@ _PRICE_OF_ENERGY = 2.0
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
-@with_weights(ADAPTIVE_MPC)
+@with_weights(ADAPTIVE_MPC, "control.adaptive_mpc")
 class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 

@@ -1,13 +1,10 @@
 """The target and the settings of planner, controllers and virtual phantom."""
 
-import warnings
-from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
 from flexneedle.costs.terms import PLAN
-from flexneedle.errors import ScenarioWarning
 from flexneedle.scenario.problems import Problem, refuse, unknown_key
 from flexneedle.scenario.sections.fields import (
     Fraction,
@@ -48,7 +45,7 @@ _OLD_KEYS = (
 )
 
 
-@with_weights(PLAN)
+@with_weights(PLAN, "plan")
 class PlanSettings(Section):
     """Section `plan`: the cross-entropy method and the cost of a plan."""
 
@@ -78,16 +75,10 @@ class PlanSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _drop_old_keys(cls, values: Any) -> Any:
-        """Return the values without the keys of the earlier cost, and report the weights of own terms."""
+        """Return the values without the keys of the earlier cost."""
         weights = ", ".join(weight.key for weight in PLAN.settings())
         why = f"the cost of a plan is in mm now; its weights: {weights}; its tolerance: tolerance_mm"
-        values = drop_old_keys(values, "plan", _OLD_KEYS, why)
-        if isinstance(values, Mapping) and isinstance(values.get("own_terms"), list | tuple):
-            line = (
-                "plan.own_terms: the cost of a plan is in mm now; divide weights of an older scenario by 20"
-            )
-            warnings.warn(line, ScenarioWarning, stacklevel=2)
-        return values
+        return drop_old_keys(values, "plan", _OLD_KEYS, why)
 
     @property
     def base_turn_sigma(self) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from inspect import Parameter, isroutine, signature
 from typing import Annotated, Any, TypeVar, cast
 
-from pydantic import AfterValidator, BeforeValidator, Field, create_model
+from pydantic import AfterValidator, BeforeValidator, Field, create_model, model_validator
 
 from flexneedle.costs.weighted_sum import Cost, TermFunction, Weight
 from flexneedle.errors import InputError, ScenarioWarning
@@ -66,7 +66,7 @@ def _choose(advice: str) -> Any:
 
 
 class OwnTerm(Section):
-    """One `[[own_terms]]`: a custom cost term."""
+    """One `[[terms]]`: a custom cost term."""
 
     term: Annotated[
         str,
@@ -92,17 +92,23 @@ def _field(weight: Weight) -> Any:
     return Field(default=weight.default, description=weight.about, json_schema_extra=extra)
 
 
-def with_weights(cost: Cost) -> Callable[[type[_Settings]], type[_Settings]]:
-    """Return a decorator of a class of settings that adds a key for each weight of a cost, and `own_terms`."""
+def with_weights(cost: Cost, section: str) -> Callable[[type[_Settings]], type[_Settings]]:
+    """Return a decorator of the settings of a section that adds a key for each weight of a cost, and `terms`."""
+
+    def drop_own_terms(values: Any) -> Any:
+        why = f"custom terms are listed in [[{section}.terms]] now, the weights in [[plan.terms]] in mm"
+        return drop_old_keys(values, section, ("own_terms",), why)
 
     def add(settings: type[_Settings]) -> type[_Settings]:
         fields: dict[str, Any] = {weight.key: (NonNegative, _field(weight)) for weight in cost.settings()}
-        fields["own_terms"] = (OwnTerms, Field(default=None, description="Further terms of the cost."))
+        fields["terms"] = (OwnTerms, Field(default=None, description="Further terms of the cost."))
+        dropping: Any = {"drop_own_terms": model_validator(mode="before")(drop_own_terms)}
         return create_model(
             settings.__name__,
             __base__=settings,
             __module__=settings.__module__,
             __doc__=settings.__doc__,
+            __validators__=dropping,
             **fields,
         )
 

@@ -10,7 +10,7 @@ const FAR = 20; // a slider ignores a bound this many times the usual value
 const STEPS = 200; // of a slider
 const OWN = "own values"; // of a table without a name
 const LAW = "Law of radial compression. A custom law is set in a scenario file.";
-const OWN_TERMS = "own_terms"; // custom cost terms are set in a scenario file
+const TERMS = "terms"; // custom cost terms are set in a scenario file
 const OWN_TYPES = { number: "number", string: "string", boolean: "boolean" }; // by type of the value
 
 // Sections with their fields: [{name, title, description, fields}]; a layer of the tissue and a table is a section.
@@ -26,7 +26,7 @@ function addSection(sections, schema, name, table, values) {
   for (const [part, property] of Object.entries(table.properties ?? {})) {
     const key = name ? `${name}.${part}` : part;
     if (key === "tissue") addLayers(sections, schema, property, values);
-    else if (part !== OWN_TERMS) addValue(sections, section, schema, key, property, values);
+    else if (part !== TERMS) addValue(sections, section, schema, key, property, values);
   }
 }
 
