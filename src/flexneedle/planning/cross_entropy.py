@@ -30,9 +30,8 @@ def elite_count(samples: int, fraction: float) -> int:
 class Search:
     """N samples, the elite ρN of them, most iterations; smoothing β: share of the old moments that is kept.
 
-    tolerance: spread of the elite costs, relative to `scale` (default: the first finite spread), at which the search
-    has converged. usual: from this iteration on it has also converged once ten iterations lowered the best cost by no
-    more than that.
+    tolerance: spread of the elite costs at which the search has converged; `relative`: over the first finite spread.
+    usual: from this iteration on it has also converged once ten iterations lowered the best cost by no more than that.
     """
 
     samples: int
@@ -41,7 +40,7 @@ class Search:
     smoothing: float
     tolerance: float
     usual: int | None = field(default=None, kw_only=True)
-    scale: float | None = field(default=None, kw_only=True)
+    relative: bool = field(default=True, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ def _has_converged(history: Sequence[dict[str, Any]], settings: Settings) -> boo
     """Return whether the elite's costs are within tolerance, or the best cost fell by less in ten iterations."""
     spreads = [_elite_spread(entry) for entry in history]
     first = next((spread for spread in spreads if np.isfinite(spread)), np.inf)
-    little = settings.tolerance * (first if settings.scale is None else settings.scale)
+    little = settings.tolerance * (first if settings.relative else 1.0)
     if not np.isfinite(little):
         return False
     if spreads[-1] <= little:

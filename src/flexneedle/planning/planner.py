@@ -265,7 +265,7 @@ def _search_settings(plan: PlanSettings, samples: int) -> Search:
         smoothing=plan.smoothing,
         tolerance=plan.tolerance_mm,
         usual=plan.iterations,
-        scale=1.0,
+        relative=False,
     )
 
 
