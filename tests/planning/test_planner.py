@@ -360,7 +360,7 @@ def test_a_force_of_the_guide_is_charged_if_it_has_a_limit():
 
 def test_the_tolerance_of_a_plan_is_a_spread_in_mm():
     search = planner._search_settings(PHANTOM.with_values({"plan.tolerance_mm": 0.02}).plan, 64)
-    assert search.tolerance * search.scale == 0.02
+    assert (search.tolerance, search.relative) == (0.02, False)
 
 
 def test_a_plan_that_two_searches_miss_is_made_of_rolls_alone(monkeypatch):
