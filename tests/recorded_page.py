@@ -174,7 +174,7 @@ def plan(strategy="manipulation", **changes):
     given = {
         "revision": 1, "reached": True, "summary": "ends 0.001 mm off", "error_mm": 0.001,
         "load": load("3.2, 1.1, 2.1", 0), "roll_deg": 0.0, "cost": 0.19,
-        "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
+        "terms": {"accuracy": 0.02, "energy": 0.12, "rolls": 0.05},
         "seconds": 0.3, **changes,
     }  # fmt: skip
     return PlanMessage(strategy=strategy, **given)
@@ -280,7 +280,7 @@ def planned():
             error_mm=2.1,
             cost=4.2,
             load=load("9, 4, 9", 2),
-            terms={"accuracy": 4.2, "flips": 9.98e-5},
+            terms={"accuracy": 4.2, "rolls": 9.98e-5},
         ),
         *plan_frames(FrameSource.STEERING, sway=-1.5),
         reach_frame(),

@@ -53,7 +53,7 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0, step=STEP):
             for k, (d, g) in enumerate(zip(depth, guide, strict=True))
         ]
     )
-    terms = {"accuracy": 0.2, "energy": 5 * energy[-1], "deflection": 1.9, "control": 1.2, "flips": 0.3}
+    terms = {"accuracy": 0.2, "energy": 5 * energy[-1], "deflection": 1.9, "control": 1.2, "rolls": 0.3}
     history = tuple({"iteration": k, "best": 9.0 / k, "quantile": 10.0 / k} for k in range(1, 13))
     return Plan(
         strategy, (*target, 0.0)[:3], seed, 0.0, controls, tips, energy, np.column_stack([guide, 0.0 * guide]), shapes,

@@ -168,7 +168,7 @@ class Plan:
     def __repr__(self) -> str:
         to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
         ends = f"ends {format_mm(self.error_mm)} off, tissue energy {self.invasiveness.energies}"
-        return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
+        return f"<Plan {to}, {ends}, rolls {self.flips}, seed {self.seed}>"
 
 
 class Action(StrEnum):

@@ -48,7 +48,7 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
         "guide force": 0.0,
         "travel": settings.travel_weight,
         "slope": settings.slope_weight_mm * ahead.left / 40.0,
-        "flips": settings.roll_weight_mm,
+        "rolls": settings.roll_weight_mm,
         "late": settings.late_roll_weight * estimate.roll_sd,
         "reach": 0.0,
         "reserve": 0.0,

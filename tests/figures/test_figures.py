@@ -368,7 +368,7 @@ def test_both_plans_are_in_one_figure_with_terms_and_angles():
     found = texts(figure)
     assert "manipulation: reaches the target to 0.010 mm (cost 7.6), enters at −2.7°" in found
     assert "steering: reaches the target to 0.010 mm (cost 14.1), enters at −0.7°" in found
-    assert {"accuracy", "energy", "deflection", "control", "flips", "4", "10.5"} <= set(found)
+    assert {"accuracy", "energy", "deflection", "control", "rolls", "4", "10.5"} <= set(found)
     assert {"planned path, manipulation", "planned path, steering"} <= set(names(*figure.legends))
     (cost,) = axes(figure, "cost")
     assert [bar.get_width() for bar in cost.containers[1]] == list(PLANS[1].terms.values())

@@ -99,7 +99,7 @@ def test_the_cost_is_the_plans_up_to_the_last_step():
     squares = np.trapezoid(shapes[:, :, 1] ** 2, axis=1) / (shapes.shape[1] - 1)
     mean_square = (squares * advance[inside]).sum() / advance[inside].sum()
     assert plan.terms["deflection"] == pytest.approx(settings.bend_weight * mean_square / 40.0, rel=0.06)
-    assert plan.terms["flips"] == pytest.approx(settings.roll_weight_mm * plan.flips)
+    assert plan.terms["rolls"] == pytest.approx(settings.roll_weight_mm * plan.flips)
     assert plan.terms["limits"] == 0.0
     assert plan.terms["miss"] == pytest.approx(plan.error_mm + plan.error_mm**2 / 0.1, abs=0.005)
 

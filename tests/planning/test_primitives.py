@@ -167,7 +167,7 @@ def test_cost_term_by_term_against_a_computation_by_hand():
         "limits": pytest.approx(100.0 * 2.0 * (0.9 / 0.8 - 1.0) * 0.2 / 0.1),
         "guide force": pytest.approx(100.0 * (1.2 / 0.8 - 1.0) * 0.2 / 0.002),
         "guide": pytest.approx(0.05 * 8.0 * (0.01 + 0.04 + 0.0025) / 3.0),
-        "flips": pytest.approx(0.015 * 2),
+        "rolls": pytest.approx(0.015 * 2),
     }
 
 
@@ -182,7 +182,7 @@ def test_each_weight_scales_its_own_term_alone():
 
 def test_first_turn_is_free_and_padding_costs_nothing():
     """Neither a start with −1 nor a step that does nothing is charged."""
-    assert terms(primitives(*[(1, 0, 0, 0, -1, 0)] * 3))["flips"] == 0.0
+    assert terms(primitives(*[(1, 0, 0, 0, -1, 0)] * 3))["rolls"] == 0.0
     shorter = replace(PROBLEM, travel=9.0)
     found = terms(primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), steps=9, problem=shorter)
     assert found["deflection"] == pytest.approx(0.16 * (4 + 5 + 6 + 7 + 8) / 5 / 8.0)
@@ -218,7 +218,7 @@ def test_the_start_roll_is_separate_from_the_first_step(sign):
     found = search_primitives(rigid, bevel_only(sign), SEARCH, np.random.default_rng(0))
     assert math.cos(found.roll) == sign
     assert (found.controls[:, ROLL] == 0.0).all()
-    assert found.terms["flips"] == 0.0
+    assert found.terms["rolls"] == 0.0
     assert found.terms["miss"] == pytest.approx(0.0, abs=1e-4)
     assert (found.controls[:, DB_Y:ROLL] == 0.0).all()
 

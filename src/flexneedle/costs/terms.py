@@ -198,11 +198,11 @@ def guide_slope(trajectories: Trajectories) -> Floats:
 @cost_term(
     "1",
     plan=Weight(
-        "flips", "roll_weight_mm", "mm", 0.015,
+        "rolls", "roll_weight_mm", "mm", 0.015,
         "Cost of a roll of the bevel.",
     ),
     adaptive_mpc=Weight(
-        "flips", "roll_weight_mm", "mm", 0.03,
+        "rolls", "roll_weight_mm", "mm", 0.03,
         "Cost of a roll of the bevel.",
     ),
 )  # fmt: skip

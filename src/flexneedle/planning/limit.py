@@ -87,8 +87,8 @@ def find_largest_load(limits: LoadLimits, simulator: Simulator, start: State, st
 
 def _limit_of_search(settings: Any, terms: Mapping[str, float]) -> str:
     """Name the weight of the term that costs more than the miss; the size of the search if none does."""
-    one_roll = PLAN.weights(settings)["flips"]  # that the plan may lack
-    charged = {**terms, "flips": max(terms["flips"], one_roll)}
+    one_roll = PLAN.weights(settings)["rolls"]  # that the plan may lack
+    charged = {**terms, "rolls": max(terms["rolls"], one_roll)}
     largest = max(charged, key=lambda name: charged[name])
     if largest in (term.term for term in settings.terms or ()):
         return f"plan.terms ({largest} costs more than the miss)"

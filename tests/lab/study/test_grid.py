@@ -263,14 +263,14 @@ def test_the_shipped_studies_load():
         "odd-targets": 150,
         "controllers": 150 * len(INCLUDED),
         "mismatch": 5 * 150,
-        "mismatch-doubled": 10_005,
+        "mismatch-doubled": 1500,
         "imperfections": 18 * 150,
         "guide-distance": 7 * 150,
         "gauges": 8 * 150,
         "tracker": 5 * 150,
         "wide": 1425,
         "worlds": 2202,
-        "space": 3 * 4 * 300,
+        "space": 3 * 4 * 150,
         "worlds-space": 5740,
     }
 
