@@ -96,7 +96,8 @@ def with_weights(cost: Cost, section: str) -> Callable[[type[_Settings]], type[_
     """Return a decorator of the settings of a section that adds a key for each weight of a cost, and `terms`."""
 
     def drop_own_terms(values: Any) -> Any:
-        why = f"custom terms are listed in [[{section}.terms]] now, the weights in [[plan.terms]] in mm"
+        unit = ", with weights in mm" if section == "plan" else ""
+        why = f"custom terms are listed in [[{section}.terms]] now{unit}"
         return drop_old_keys(values, section, ("own_terms",), why)
 
     def add(settings: type[_Settings]) -> type[_Settings]:

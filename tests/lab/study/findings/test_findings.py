@@ -113,14 +113,13 @@ def test_loads_of_controllers_are_compared_pair_by_pair(read):
         row |= {
             "peak_energy_uj": factor * own["peak_energy_uj"],
             "mean_energy_uj": 0.5 * own["mean_energy_uj"],
+            "strain_energy_mj": 3.0 * own["strain_energy_mj"],
         }
         row["guide_travel_mm"] = own["guide_travel_mm"] + 1.0
     found = read(rows)
     (found,) = compare_controllers(found.rows, find_design(found))
-    values = [
-        each.value for each in (found.peak_energy_ratio, found.mean_energy_ratio, found.guide_travel_mm)
-    ]
-    assert_allclose(values, (4.0, 0.5, 1.0))
+    energies = found.peak_energy_ratio, found.mean_energy_ratio, found.end_energy_ratio
+    assert_allclose([each.value for each in (*energies, found.guide_travel_mm)], (4.0, 0.5, 3.0, 1.0))
 
 
 def test_a_pair_with_one_unfinished_is_left_out_and_few_pairs_have_no_verdict(read):

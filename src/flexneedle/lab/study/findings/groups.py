@@ -60,8 +60,8 @@ class SettingGroup:
 class Difference:
     """Mean paired difference (mm) of true errors, `name` minus `against`, between insertions otherwise identical.
 
-    pairs: both finished; left_out: pairs with an unfinished insertion; peak_energy_ratio, mean_energy_ratio: geometric
-    means of `name` over `against` where both energies are positive; guide_travel_mm: mean difference of the travel in
+    pairs: both finished; left_out: pairs with an unfinished insertion; …_energy_ratio: geometric means of
+    `name` over `against` where both energies are positive; guide_travel_mm: mean difference of the travel in
     the tissue; verdict: "better" if the interval of the error's difference is below 0, "worse" if above, otherwise "not
     separable"; None without an interval.
     """
@@ -74,6 +74,7 @@ class Difference:
     mean_mm: IntervalEstimate
     peak_energy_ratio: IntervalEstimate
     mean_energy_ratio: IntervalEstimate
+    end_energy_ratio: IntervalEstimate
     guide_travel_mm: IntervalEstimate
     verdict: str | None
 
@@ -251,11 +252,12 @@ def _compare_sides(
     known = (done & ~np.isnan(error))[both].all(axis=1)
     pairs = both[known]
     (first, second), travel, loads = pairs.T, rows.number("guide_travel_mm"), find_loads(rows)
-    peak, average = loads["peak_energy_uj"], loads["mean_energy_uj"]
+    stored = {of: loads[f"{of}_energy_uj"] for of in ENERGIES}
     statistics = {
         "mean_mm": mean(error[first] - error[second]),
-        "peak_energy_ratio": _relate_each(peak[first], peak[second]),
-        "mean_energy_ratio": _relate_each(average[first], average[second]),
+        **{
+            f"{of}_energy_ratio": _relate_each(of_all[first], of_all[second]) for of, of_all in stored.items()
+        },
         "guide_travel_mm": mean(travel[first] - travel[second]),
     }
     found = estimate_all(statistics, _renumber(rows.codes("seed")[first]))
