@@ -25,7 +25,7 @@ def test_the_page_has_a_step_for_each_command_of_a_rig_and_is_short():
     assert len(PAGE.split()) < 600
 
 
-@pytest.mark.long
+@pytest.mark.slow  # two minutes and more in real time
 def test_the_commands_of_the_page_run_on_an_emulated_rig(tmp_path):
     """From the file of the rig to motors that are off, each with exit status 0."""
     path = rig_file(tmp_path)

@@ -249,7 +249,12 @@ def test_an_insertion_that_just_has_room_begins_unless_the_room_is_lost_during_t
     assert rest.calls == ["read", "asked", "read", "closed"]
 
 
-OF_A_PHANTOM = ("/needle/true_shape", "/tip/true", "/tissue/true_strain_energy")
+OF_A_PHANTOM = (
+    "/needle/true_shape",
+    "/tip/true",
+    "/tissue/true_strain_energy",
+    "/tissue/true_relative_energy",
+)
 
 
 def assert_trace_of_a_simulated_run(done, folder, without):

@@ -6,8 +6,10 @@ import socket
 import subprocess
 import sys
 import time
+from collections import defaultdict, deque
 from dataclasses import replace
 from itertools import count
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +25,8 @@ from flexneedle.lab.ros import client
 from flexneedle.lab.ros.client import NodeClient, open_node
 from flexneedle.lab.ros.composer import MessageComposer
 from flexneedle.lab.ros.dds import TopicReader, TopicWriter, make_user_data
+from flexneedle.lab.ros.node import RosNode
+from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.records import (
     JointTargets,
@@ -111,6 +115,20 @@ def test_late_targets_of_joints_are_not_sent(measuring):
 
 
 # Received
+
+
+def test_stops_that_readers_have_in_another_order_are_forwarded_once():
+    """Of two stops one reader has the second, when another still has both."""
+    sent, stops = [], Subscription(NEUTRAL, "stop")
+    node = SimpleNamespace(
+        _read=defaultdict(deque),
+        _is_repeated=lambda _: False,
+        _channel=SimpleNamespace(send=lambda record, **_: sent.append(record)),
+    )
+    for sources in ((1, 2), (2,), (1, 2)):
+        messages = [(cdr(Bool(True)), (7, source)) for source in sources]
+        RosNode._forward(node, stops, SimpleNamespace(writers=1, take=lambda messages=messages: messages))
+    assert [type(record) for record in sent] == [RosStop, RosStop]
 
 
 def test_a_stop_an_arm_and_a_target_reach_the_rig(node):

@@ -9,6 +9,7 @@ ends when the other end is closed.
 
 import signal
 import sys
+from collections import defaultdict, deque
 from threading import Event, Thread
 from time import monotonic
 
@@ -34,6 +35,7 @@ from flexneedle.lab.ros.records import (
 BEAT_S = 0.1
 STALE_S = 0.1
 """Older joint targets are not published: a command is carried out in time or not at all."""
+_REMEMBERED = 64  # messages of a topic, of which a repetition is recognised
 _SWITCH_S = 5e-4  # longest time that a stop waits for a thread that makes messages
 
 Input = tuple[Subscription, list[TopicReader]]
@@ -70,7 +72,7 @@ class RosNode:
         self._inputs = sorted(
             make_inputs(self._domain, setup.profile), key=lambda each: each[0].key != "stop"
         )
-        self._newest: dict[str, tuple[int, int]] = {}
+        self._read: defaultdict[str, deque[tuple[int, int]]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
         self._refused: dict[str, float] = {}
         self._listener = Thread(target=self._listen, name="listener", daemon=True)
 
@@ -108,11 +110,14 @@ class RosNode:
     def _forward(self, subscription: Subscription, reader: TopicReader) -> None:
         publishers = reader.writers
         for data, source in reader.take():
-            if self._newest.get(subscription.key) != source:  # a stop has several readers
-                record = subscription.read(data, monotonic(), publishers)
-                if record is not None and not self._is_repeated(record):
-                    self._channel.send(record, keep=isinstance(record, RosStop | RosArm))
-            self._newest[subscription.key] = source
+            if (
+                source in self._read[subscription.key]
+            ):  # a stop has several readers, each with messages of its own
+                continue
+            self._read[subscription.key].append(source)
+            record = subscription.read(data, monotonic(), publishers)
+            if record is not None and not self._is_repeated(record):
+                self._channel.send(record, keep=isinstance(record, RosStop | RosArm))
 
     def _is_repeated(self, record: Received) -> bool:
         """Return whether a record is a refusal soon after one of the same topic, as in a flood of messages."""
