@@ -110,9 +110,7 @@ class RosNode:
     def _forward(self, subscription: Subscription, reader: TopicReader) -> None:
         publishers = reader.writers
         for data, source in reader.take():
-            if (
-                source in self._read[subscription.key]
-            ):  # a stop has several readers, each with messages of its own
+            if source in self._read[subscription.key]:  # a stop has several readers
                 continue
             self._read[subscription.key].append(source)
             record = subscription.read(data, monotonic(), publishers)
