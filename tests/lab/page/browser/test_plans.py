@@ -143,7 +143,7 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
     cells = table(page)
     assert cells["Cost: accuracy"] == ["0.02", "4.2"]
     assert cells["Cost: energy"] == ["0.12", "–"]
-    assert cells["Cost: flips"] == ["0.05", "0.0000998"]
+    assert cells["Cost: rolls"] == ["0.05", "0.0000998"]
     assert cells["Cost (mm)"] == ["0.19", "4.2"]
     assert cells["bevel rolls"] == ["0", "2"]
     assert cells["tissue energy: peak, mean, end"] == ["3.2, 1.1, 2.1 µJ", "9, 4, 9 µJ"]
