@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections import defaultdict, deque
 from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace
@@ -25,7 +24,7 @@ from flexneedle.lab.ros import client
 from flexneedle.lab.ros.client import NodeClient, open_node
 from flexneedle.lab.ros.composer import MessageComposer
 from flexneedle.lab.ros.dds import TopicReader, TopicWriter, make_user_data
-from flexneedle.lab.ros.node import RosNode
+from flexneedle.lab.ros.node import RosNode, make_memory
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.records import (
@@ -121,7 +120,7 @@ def test_stops_that_readers_have_in_another_order_are_forwarded_once():
     """Of two stops one reader has the second, when another still has both."""
     sent, stops = [], Subscription(NEUTRAL, "stop")
     node = SimpleNamespace(
-        _read=defaultdict(deque),
+        _read=make_memory(),
         _is_repeated=lambda _: False,
         _channel=SimpleNamespace(send=lambda record, **_: sent.append(record)),
     )

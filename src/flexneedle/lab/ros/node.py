@@ -56,6 +56,11 @@ def _make_readers(domain: DomainParticipant, subscription: Subscription) -> list
     return [TopicReader(domain, topic, kind, reliable=subscription.key in ("target", "arm"))]
 
 
+def make_memory() -> defaultdict[str, deque[tuple[int, int]]]:
+    """Return the sources of the last messages by key; none yet."""
+    return defaultdict(lambda: deque(maxlen=_REMEMBERED))
+
+
 class RosNode:
     """Writers and readers of a profile."""
 
@@ -72,7 +77,7 @@ class RosNode:
         self._inputs = sorted(
             make_inputs(self._domain, setup.profile), key=lambda each: each[0].key != "stop"
         )
-        self._read: defaultdict[str, deque[tuple[int, int]]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
+        self._read = make_memory()
         self._refused: dict[str, float] = {}
         self._listener = Thread(target=self._listen, name="listener", daemon=True)
 

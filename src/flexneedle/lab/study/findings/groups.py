@@ -60,10 +60,10 @@ class SettingGroup:
 class Difference:
     """Mean paired difference (mm) of true errors, `name` minus `against`, between insertions otherwise identical.
 
-    pairs: both finished; left_out: pairs with an unfinished insertion; …_energy_ratio: geometric means of
-    `name` over `against` where both energies are positive; guide_travel_mm: mean difference of the travel in
-    the tissue; verdict: "better" if the interval of the error's difference is below 0, "worse" if above, otherwise "not
-    separable"; None without an interval.
+    pairs: both finished; left_out: pairs with an unfinished insertion; …_energy_ratio: geometric means of `name` over
+    `against` where both energies are positive; guide_travel_mm: mean difference of the travel in the tissue; verdict:
+    "better" if the interval of the error's difference is below 0, "worse" if above, otherwise "not separable"; None
+    without an interval.
     """
 
     name: str
