@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from flexneedle.mechanics.law import tables
 from flexneedle.mechanics.model import CONTACT
-from flexneedle.phantom.tearing import TornLaw
 from flexneedle.scenario.tissue.laws import LAWS
+from flexneedle.scenario.tissue.torn import TornLaw
 from flexneedle.simulator.simulator import Simulator
 from mechanics.test_law import SIZE, of, tabled
 from phantoms import AHEAD, STRAIGHT, both_plants, driven, make_phantom
@@ -104,6 +104,6 @@ def test_the_bevel_has_the_intact_law(kind):
 def test_only_contacts_tear_in_the_model():
     phantom = make_phantom(IDEAL, "model", yield_mm=0.5)
     model, intact = phantom._plant._simulator.model, Simulator(IDEAL, threads=1).model
-    assert (model.layers == intact.layers).all()
+    assert (model.layers["law"] == intact.layers["law"]).all()
     assert ((model.nodes["law"] != intact.nodes["law"]) == (model.nodes["kind"] == CONTACT)).all()
     assert len(model.laws) == len(intact.laws) + len(IDEAL.tissue)

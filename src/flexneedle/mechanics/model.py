@@ -42,6 +42,7 @@ LAYER = np.dtype(
         ("height", np.float64),  # compression length (mm)
         ("stiffness", np.float64),  # initial stiffness of 1 mm of needle (N/mm)
         ("law", np.int64),  # index of its table
+        ("channel", np.int64),  # index of the table along the channel
     ]
 )
 
@@ -75,14 +76,22 @@ def records(dtype: np.dtype[Any], /, **columns: Any) -> NDArray[Any]:
 
 
 def tissue_layers(
-    thickness: Floats, modulus: Floats, height: Floats, width: Floats, law: NDArray[Any]
+    thickness: Floats,
+    modulus: Floats,
+    height: Floats,
+    width: Floats,
+    law: NDArray[Any],
+    channel: NDArray[Any] | None = None,
 ) -> Layers:
     """Return layers from arrays (k,) in mm and MPa; the last one has no end, so its thickness is ignored.
 
-    modulus: initial modulus of compression; law: index of each layer's table.
+    modulus: initial modulus of compression; law: index of each layer's table, for the tip spring; channel: index of
+    its table along the channel (default: the same).
     """
-    end = np.append(np.cumsum(thickness[:-1]), np.inf)
-    return records(LAYER, end=end, height=height, stiffness=modulus * width / height, law=law)
+    end, along = np.append(np.cumsum(thickness[:-1]), np.inf), law if channel is None else channel
+    return records(
+        LAYER, end=end, height=height, stiffness=modulus * width / height, law=law, channel=along
+    )
 
 
 def contact_nodes(
@@ -109,10 +118,23 @@ def contact_nodes(
         height=layer["height"],
         stiffness=layer["stiffness"] * length,
         weight=weight[at],
-        law=layer["law"],
+        law=layer["channel"],
         kind=CONTACT,
     )
     return contacts if guide_x is None else insert_essential(contacts, np.array([guide_x]), GUIDE)
+
+
+def with_channel_laws(model: Model, laws: Floats, place: Sequence[int]) -> Model:
+    """Return the model with further laws, tables of `law`, at its contacts; the tip spring keeps its own.
+
+    place: for each layer the index of its law.
+    """
+    nodes, layers = model.nodes.copy(), model.layers.copy()
+    layers["channel"] = len(model.laws) + np.array(place)
+    contact = nodes["kind"] == CONTACT
+    at = layers["end"].searchsorted(nodes["x"][contact], side="right")
+    nodes["law"][contact] = layers["channel"][at]
+    return model._replace(nodes=nodes, layers=layers, laws=np.concatenate([model.laws, laws]))
 
 
 def insert_essential(nodes: Nodes, x: Floats, kind: float = ESSENTIAL) -> Nodes:
@@ -204,7 +226,7 @@ def _adapt_tissue(model: Model, adaptation: Adaptation) -> Model:
     layers["end"][:-1], layers["end"][-1] = bottoms, np.inf
     at, contact = old[ends.searchsorted(nodes["x"], side="right")], nodes["kind"] == CONTACT
     changed, stiffness = nodes.copy(), _integral(bottoms, layers["stiffness"], nodes)
-    for name, values in (("stiffness", stiffness), ("height", at["height"]), ("law", at["law"])):
+    for name, values in (("stiffness", stiffness), ("height", at["height"]), ("law", at["channel"])):
         changed[name] = np.where(contact, values, nodes[name])
     return model._replace(nodes=changed, layers=layers)
 

@@ -5,19 +5,20 @@ import numpy as np
 from flexneedle.mechanics import law
 from flexneedle.mechanics.model import SKIN_PART, SKIN_ZONE, Model, contact_nodes, tissue_layers
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.tissue.layer import laws_of
+from flexneedle.scenario.tissue.layer import all_laws
 
 
 def build_model(scenario: Scenario) -> Model:
     """Return the constants of a scenario, before any adaptation."""
     tissue, needle = scenario.tissue, scenario.needle
-    laws, place = laws_of(tissue)
+    laws, place, channel = all_laws(tissue)
     layers = tissue_layers(
         np.array([layer.thickness_mm or np.inf for layer in tissue]),
         np.array([layer.modulus for layer in tissue]),
         np.array([layer.compression_length_mm for layer in tissue]),
         np.array([layer.engaged_width_mm for layer in tissue]),
         np.array(place),
+        np.array(channel),
     )
     weight = np.array([layer.energy_weight for layer in tissue])
     depth = max(scenario.setup.max_depth, 0.0)

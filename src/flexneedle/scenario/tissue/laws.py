@@ -1,6 +1,6 @@
 """The laws by name, and the layers of a scenario, each by its law. A new law is a file here with a `Layer` subclass."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -24,13 +24,19 @@ def _is_law(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, Layer) and value is not Layer
 
 
+def _subclasses(of: type[Layer]) -> Iterator[type[Layer]]:
+    for law in of.__subclasses__():
+        yield law
+        yield from _subclasses(law)
+
+
 def _find_laws() -> dict[str, type[Layer]]:
     """Return the subclasses of Layer in the files of this folder, by the names of their files."""
     package = __name__.rpartition(".")[0]
     for file in iter_modules([str(Path(__file__).parent)]):
         if file.name != "laws":
             import_module(f"{package}.{file.name}")
-    laws = {law.__module__: law for law in Layer.__subclasses__()}
+    laws = {law.__module__: law for law in _subclasses(Layer)}
     return {
         module.rpartition(".")[2]: law for module, law in laws.items() if module.startswith(f"{package}.")
     }

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from pydantic import ValidationError, model_validator
@@ -17,6 +17,27 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _BEVEL_MARGIN = 0.001
+
+
+class ChannelLaw(Protocol):
+    """A law of radial compression, as a `Layer` has; see `mechanics.law.Law`."""
+
+    @property
+    def limit(self) -> float:
+        """Relative compression up to which the law is valid."""
+        ...
+
+    def energy(self, e: "Floats") -> "Floats":
+        """Return the energy at relative compressions e, over k h²."""
+        ...
+
+    def force(self, e: "Floats") -> "Floats":
+        """Return the force, over k h."""
+        ...
+
+    def stiffness(self, e: "Floats") -> "Floats":
+        """Return the stiffness, over k."""
+        ...
 
 
 class _Young(Section):
@@ -38,7 +59,7 @@ class Layer(Section):
     """Relative compression e, below 1, up to which the law is valid."""
 
     law: str
-    """`ogden`, `linear` (without `alpha`) or `module:NAME`."""
+    """`ogden`, `linear` (without `alpha`), `tearing` (with `yield_mm`) or `module:NAME`."""
     name: Title = "tissue"
     """Name in tables and figures."""
     thickness_mm: Positive | None = None
@@ -88,12 +109,17 @@ class Layer(Section):
         """Largest bevel offset that is drawn or fitted."""
         return (self.limit - _BEVEL_MARGIN) * self.compression_length_mm
 
+    @property
+    def channel(self) -> ChannelLaw:
+        """The law along the channel; the layer itself unless its channel tears. The bevel's spring has the layer's."""
+        return self
+
     def energy_per_mm(self, displacement: float) -> float:
         """Return the energy (mJ) of the tissue beside 1 mm of needle that is displaced laterally (mm), not weighted."""
-        h = self.compression_length_mm
-        inside = np.minimum([displacement / h], self.limit)
+        h, law = self.compression_length_mm, self.channel
+        inside = np.minimum([displacement / h], law.limit)
         beyond = displacement / h - inside
-        stored = self.energy(inside) + (self.force(inside) + 0.5 * self.stiffness(inside) * beyond) * beyond
+        stored = law.energy(inside) + (law.force(inside) + 0.5 * law.stiffness(inside) * beyond) * beyond
         return float(self.modulus * self.engaged_width_mm * h * stored[0])
 
     @abstractmethod
@@ -115,6 +141,17 @@ def laws_of(tissue: Sequence[Layer]) -> tuple[list[Layer], list[int]]:
     laws = dict(zip(keys, tissue, strict=True))
     place = {key: k for k, key in enumerate(laws)}
     return list(laws.values()), [place[key] for key in keys]
+
+
+def all_laws(tissue: Sequence[Layer]) -> tuple[list[ChannelLaw], list[int], list[int]]:
+    """Return all laws, and for each layer the index of its law, and of the law along its channel."""
+    intact, place = laws_of(tissue)
+    laws, channel = [*intact], [*place]
+    for k, layer in enumerate(tissue):
+        if layer.channel is not layer:
+            channel[k] = len(laws)
+            laws.append(layer.channel)
+    return laws, place, channel
 
 
 def _law_key(layer: Layer) -> tuple[Any, ...]:

@@ -35,7 +35,7 @@ class Ogden(Layer):
     limit: ClassVar[float] = 0.7
 
     law: Literal["ogden"] = "ogden"
-    """`ogden`, `linear` (without `alpha`) or `module:NAME`."""
+    """`ogden`, `linear` (without `alpha`), `tearing` (with `yield_mm`) or `module:NAME`."""
     alpha: Annotated[Alpha, Field(examples=[8.74])]
     """α, exponent of the Ogden law."""
 

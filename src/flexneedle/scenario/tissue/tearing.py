@@ -1,0 +1,21 @@
+"""Tissue that tears: the Ogden law up to a displacement, from which the force of the channel saturates."""
+
+from typing import Literal
+
+from flexneedle.scenario.sections.fields import Positive
+from flexneedle.scenario.tissue.ogden import Ogden
+from flexneedle.scenario.tissue.torn import TornLaw
+
+
+class Tearing(Ogden):
+    """A layer with the one-term Ogden law, whose channel tears; the bevel's spring has the intact law."""
+
+    law: Literal["tearing"]
+    """Law of radial compression."""
+    yield_mm: Positive
+    """Lateral displacement from which the tissue tears."""
+
+    @property
+    def channel(self) -> TornLaw:
+        """The law along the channel."""
+        return TornLaw(self, self.yield_mm / self.compression_length_mm)
