@@ -57,7 +57,7 @@ def test_arguments_that_cannot_be_used(call, message):
         ({"cell": np.ones(3)}, "cell = .* must be a number"),
         ({"bevel": -0.1}, "bevel = -0.1: must be at least 0"),
         ({"bend": 1j}, "bend = 1j: must be real numbers"),
-        ({"clearance": None}, "clearance = None: must be finite"),
+        ({"clearance": np.nan}, "clearance = nan: must be finite"),
     ],
 )
 def test_adaptations_that_cannot_be_used(changes, message):

@@ -41,6 +41,17 @@ def loaded(clearance, depth, guide, base_y=0.0, base_turn=0.0):
     return states + repeat(simulator, states[-1], Control(dg_y=guide / max(steps, 1)), steps)
 
 
+def test_the_clearance_of_a_scenario_is_in_its_model_and_stays_with_other_changes():
+    scenario = PHANTOM.with_values({"setup.guide_clearance_mm": 0.05})
+    simulator = Simulator(scenario)
+    same = Adaptation(np.zeros(1), np.ones(2))
+    assert simulator.model.clearance == simulator.adapt(same).clearance == 0.05
+    assert simulator.adapt(same._replace(clearance=0.1)).clearance == 0.1
+    moved = [each.step(each.start(), Control(dg_y=0.04)).tip[1] for each in (simulator, Simulator(PHANTOM))]
+    assert moved[0] == pytest.approx(0.0, abs=1e-9)
+    assert moved[1] != pytest.approx(0.0, abs=1e-3)
+
+
 # ---- in air, where the needle is straight until something touches it
 
 

@@ -70,7 +70,7 @@ class Priors(Section):
     tilt_sd_mrad: NonNegative = 10.0
     """Prior standard deviation, per axis, of the angle between measured direction and needle."""
     clearance_mm: NonNegative = 0.05
-    """Prior mean of the guide clearance, to either side."""
+    """Prior mean of the guide clearance, to either side, where `setup.guide_clearance_mm` is not set."""
     clearance_sd_mm: NonNegative = 0.02
     """Prior standard deviation of the guide clearance."""
     modulus_log_sd: NonNegative = 0.3
@@ -125,7 +125,9 @@ class Prior:
         )
         sd = np.maximum([*single, *[settings.variation_sd] * cells], LEAST_SD)
         mean = np.where(np.arange(sd.size) == slots.bevel, 1.0, 0.0)
-        mean[slots.clearance] = settings.clearance_mm if scenario.setup.has_guide else 0.0
+        if scenario.setup.has_guide:
+            known = scenario.setup.guide_clearance_mm
+            mean[slots.clearance] = settings.clearance_mm if known is None else known
         precision = np.diag(sd**-2.0)
         precision[-cells:, -cells:] = inverse_correlation(
             cells, settings.cell_mm / settings.variation_length_mm

@@ -150,7 +150,7 @@ class Adaptation(NamedTuple):
     cells along the depth from the skin, mm. variation (c,): further factors in the cells, of which the last has no end.
     bevel: factor on the bevel's offset. bend: lateral distance of the free needle's tip from the straight, mm (in space
     y + iz), relative to the bevel's direction, with which it turns. clearance: of the needle in the guide, to either
-    side, mm.
+    side, mm; None: as before.
     """
 
     shift: Floats
@@ -159,7 +159,7 @@ class Adaptation(NamedTuple):
     variation: Floats = np.ones(1)
     bevel: float = 1.0
     bend: Any = 0.0
-    clearance: float = 0.0
+    clearance: float | None = None
 
 
 def check_adaptation(model: Model, adaptation: Adaptation) -> Adaptation:
@@ -168,6 +168,8 @@ def check_adaptation(model: Model, adaptation: Adaptation) -> Adaptation:
     shapes = {"shift": (layers - 1,), "stiffness": (layers,), "variation": None}
     checked: dict[str, Any] = {}
     for name, given in adaptation._asdict().items():
+        if name == "clearance" and given is None:
+            continue
         shape = shapes.get(name, ())
         try:
             values = np.array(given, dtype=complex if name == "bend" and space else float)
@@ -198,15 +200,19 @@ def adapt(model: Model, adaptation: Adaptation) -> Model:
     return adapt_needle(tissue, adaptation.bevel, adaptation.bend, adaptation.clearance)
 
 
-def adapt_needle(model: Model, bevel: float, bend: Any, clearance: float) -> Model:
+def adapt_needle(model: Model, bevel: float, bend: Any, clearance: float | None) -> Model:
     """Return the model with another needle; arguments as of `Adaptation`."""
     return model._replace(
         bevel_offset=model.bevel_offset * bevel,
         # Of one type with and without an adaptation, so that kernels are compiled once.
         curvature=type(model.curvature)(2.0 * bend / model.length**2),
-        # Below the tolerance of the solve the side that the needle bears on would be rounding.
-        clearance=clearance if clearance > model.slide else 0.0,
+        clearance=model.clearance if clearance is None else usable_clearance(clearance, model.slide),
     )
+
+
+def usable_clearance(clearance: float, tolerance: float) -> float:
+    """Return a clearance (mm), or 0 below the tolerance of a solve: the side that the needle bears on is rounding."""
+    return clearance if clearance > tolerance else 0.0
 
 
 def _adapt_tissue(model: Model, adaptation: Adaptation) -> Model:

@@ -29,6 +29,9 @@ def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
     if guide is not None and tip >= guide:
         rule = f"the tip would start behind the guide: must be below setup.guide_to_skin_mm ({guide:g})"
         yield Problem("setup.tip_to_skin_mm", tip, rule)
+    if guide is None and setup.guide_clearance_mm is not None:
+        rule = "must not be set without a guide (setup.guide_to_skin_mm)"
+        yield Problem("setup.guide_clearance_mm", setup.guide_clearance_mm, rule)
     if setup.max_rotation_deg is not None and setup.half_turns:
         rule = f"must not be set where the needle rolls by half turns ({setup.half_turns_by})"
         yield Problem("setup.max_rotation_deg", setup.max_rotation_deg, rule)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flexneedle.mechanics import law
-from flexneedle.mechanics.model import SKIN_PART, SKIN_ZONE, Model, contact_nodes, tissue_layers
+from flexneedle.mechanics.model import SKIN_PART, SKIN_ZONE, Model, adapt_needle, contact_nodes, tissue_layers
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import all_laws
 
@@ -24,7 +24,7 @@ def build_model(scenario: Scenario) -> Model:
     depth = max(scenario.setup.max_depth, 0.0)
     nodes = contact_nodes(layers, weight, scenario.contact.spacing_mm, depth, scenario.setup.guide_x)
     bevel, spacing = needle.bevel, scenario.contact.spacing_mm
-    return Model(
+    model = Model(
         needle.bending_stiffness,
         needle.length_mm,
         bevel.offset_mm,
@@ -36,3 +36,4 @@ def build_model(scenario: Scenario) -> Model:
         zone=SKIN_ZONE * spacing,
         curvature=0.0 if scenario.setup.axes == 1 else 0j,
     )
+    return adapt_needle(model, 1.0, 0.0, scenario.setup.guide_clearance_mm)

@@ -37,6 +37,9 @@ class Setup(Section):
     """Largest angle to either side of angle 0, with free rotation. Not set: no limit."""
     guide_to_skin_mm: Positive | None = None
     """G, distance from guide to skin. Not set: no guide."""
+    guide_clearance_mm: NonNegative | None = None
+    """Clearance of the needle in the guide, to either side. Not set: 0 in plans; `adaptive-mpc` estimates it from
+    the prior of its settings."""
     tip_to_skin_mm: Positive
     """Distance from tip to skin at the start."""
     stroke_mm: Positive
