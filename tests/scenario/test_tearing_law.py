@@ -45,9 +45,7 @@ def test_an_adapted_channel_still_tears():
     contact = adapted.nodes["kind"] == CONTACT
     assert (adapted.nodes["law"][contact] == adapted.layers["channel"][0]).all()
     assert (adapted.layers["law"] != adapted.layers["channel"]).all()
-    np.testing.assert_allclose(
-        guided(simulator.with_model(adapted)), guided(simulator), atol=1e-9
-    )
+    np.testing.assert_allclose(guided(simulator.with_model(adapted)), guided(simulator), atol=1e-9)
 
 
 def test_the_energy_of_displaced_tissue_is_the_torn_one():

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.errors import CommandError
@@ -9,6 +11,7 @@ from reference.cases import assert_same_curve, insert_to, repeat
 
 PHANTOM = load_scenario("phantom")
 SIMULATOR = Simulator(PHANTOM)
+SPACE = load_scenario("phantom3d")
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +52,41 @@ def test_reaction_is_the_load_that_the_model_lacks(state):
     assert SIMULATOR.step(held, Control()).tip[1] < y + 0.3
 
 
+@pytest.mark.parametrize("axes", [1, 2])
+def test_a_held_pose_of_a_free_needle_needs_the_loads_of_a_cantilever(axes):
+    """F = EI (12 y/L³ − 6 θ/L²), M = EI (4 θ/L − 6 y/L²)."""
+    free = {
+        "setup.axes": axes,
+        "setup.guide_to_skin_mm": None,
+        "setup.stroke_mm": 100.0,
+        "target.lateral_mm": 0.0,
+    }
+    simulator = Simulator(PHANTOM.with_values(free))
+    start, (y, slope) = simulator.start(), (np.array([0.8, -0.5])[:axes], np.array([0.01, 0.004])[:axes])
+    held, _ = simulator.assimilate(start, (start.tip[0], *y), slope=slope)
+    stiffness, length = PHANTOM.needle.bending_stiffness, held.tip[0] - held.base[0]
+    np.testing.assert_allclose(held.tip[1 : 1 + axes], y, atol=1e-12)
+    np.testing.assert_allclose(held.tip[3 : 3 + axes], slope, atol=1e-12)
+    force = stiffness * (12.0 * y / length**3 - 6.0 * slope / length**2)
+    moment = stiffness * (4.0 * slope / length - 6.0 * y / length**2)
+    np.testing.assert_allclose(held.reactions.tip_force[:axes], force, rtol=1e-6)
+    np.testing.assert_allclose(held.reactions.tip_moment[:axes], moment, rtol=1e-6)
+
+
+def test_a_held_slope_changes_nothing_where_it_agrees_and_else_needs_a_moment(state):
+    x, y, _, slope, _ = state.tip
+    same, _ = SIMULATOR.assimilate(state, (x, y), slope=(slope,))
+    assert_same_curve(same, state, 1e-6)
+    assert same.reactions.tip_moment == pytest.approx((0.0, 0.0), abs=1e-6)
+    turned, _ = SIMULATOR.assimilate(state, (x, y), slope=(slope + 0.01,))
+    assert turned.converged
+    assert turned.tip[[1, 3]].tolist() == pytest.approx([y, slope + 0.01], abs=1e-12)
+    assert turned.reactions.tip_moment[0] > 1.0
+    free, _ = SIMULATOR.assimilate(state, (x, y))
+    assert free.reactions.tip_moment == (0.0, 0.0)
+    assert SIMULATOR.step(turned, Control()).tip[3] == pytest.approx(slope, abs=2e-3)
+
+
 def test_order_of_measured_points_does_not_matter(state):
     """They are sorted, and the caller's list stays as it is."""
     points = [(20.2, 3.0), (-20.0, 1.2), (-30.0, 1.0), (5.1, 2.0)]  # two of them between the same nodes
@@ -76,3 +114,40 @@ def test_impossible_measurements_are_refused(state, tip, points, name):
     with pytest.raises(CommandError) as caught:
         SIMULATOR.assimilate(state, tip, points)
     assert caught.value.name == name
+
+
+poses = st.tuples(*[st.floats(-bound, bound) for bound in (1.5, 1.5, 0.03, 0.03)])
+
+
+@given(pose=poses, ahead=st.floats(0.0, 20.0))
+def test_a_needle_in_air_starts_straight_at_the_measured_pose_of_its_tip(pose, ahead):
+    """Base and guide are on its line, so that nothing bends it; only the guide is off its home."""
+    simulator = Simulator(SPACE)
+    state = simulator.start(0.0, (-ahead, *pose[:2]), pose[2:])
+    x, line = state.nodes[:, 0], state.nodes[:, 1:3]
+    np.testing.assert_allclose(line, np.add(pose[:2], np.outer(x + ahead, pose[2:])), atol=1e-4)
+    np.testing.assert_allclose(state.tip, [-ahead, *pose], atol=1e-6)
+    np.testing.assert_allclose(state.reactions.guide_force, 0.0, atol=1e-5)
+    np.testing.assert_allclose(state.travel[:5], 0.0, atol=1e-9)
+
+
+def test_a_needle_that_starts_as_in_the_scenario_is_where_the_scenario_has_it():
+    simulator = Simulator(SPACE)
+    given = simulator.start(0.4, simulator.start().tip[:3], simulator.start().tip[3:])
+    np.testing.assert_allclose(given.nodes, simulator.start(0.4).nodes, atol=1e-12)
+
+
+def test_a_tip_in_tissue_is_no_start():
+    with pytest.raises(CommandError, match=r"measured tip x = 2.*before the skin"):
+        SIMULATOR.start(0.0, (2.0, 0.0), (0.0,))
+    with pytest.raises(CommandError, match=r"coordinates of a measured slope"):
+        SIMULATOR.start(0.0, (-2.0, 0.0), (0.0, 0.0))
+
+
+@pytest.mark.parametrize("depth", [33.7, 30.02, 12.5])
+def test_the_tip_is_advanced_to_a_depth(state, depth):
+    """Also where the needle has become shorter along its axis since a guide has bent it."""
+    bent = SIMULATOR.step(state, Control(dg_y=0.5))
+    reached = SIMULATOR.advance_to(bent, depth)
+    assert reached.tip[0] == pytest.approx(depth, abs=1e-5)
+    assert reached.converged

@@ -7,7 +7,7 @@ from flexneedle.mechanics.contact import contact_rest
 from flexneedle.mechanics.iteration import count_before
 from flexneedle.mechanics.lanes import least, load, most, select, some, store, whole
 from flexneedle.mechanics.lateral import Lateral, lateral, rotate, times
-from flexneedle.mechanics.needle import Boundary, Cut, CutChannel, Equilibrium, NeedleState, NodePose
+from flexneedle.mechanics.needle import Boundary, Cut, CutChannel, Equilibrium, Held, NeedleState, NodePose
 from flexneedle.mechanics.solve import Solution, solve
 from flexneedle.mechanics.spring import spring_rest
 from flexneedle.mechanics.work import CONTACT, GUIDE, KIND, REST, Columns, Needles, X
@@ -38,9 +38,9 @@ def _move_boundary(boundary: Boundary, command: Columns, share: float, roll: flo
 
 @shared
 def settle_needles(
-    w: Needles, needle: NeedleState, held: Lateral, live: bool, near: int
+    w: Needles, needle: NeedleState, held: Held, live: bool, near: int
 ) -> tuple[NeedleState, int]:
-    """Solve with the present base and guide, and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
+    """Solve with the present base and guide, and lay the cut; what of the tip is `held` is essential.
 
     Arrays are changed in place, as in `solve`, which explains `near`. Out of the skin the channel is closed.
     """
@@ -94,14 +94,14 @@ def advance_needles(w: Needles, needle: NeedleState, command: Columns, near: int
     roll, done = load(command, 0, ROLL), 0.0 * advance
     residual, converged = done, 1.0 + done
     live = done < 1.0
-    free = times(math.nan, needle.boundary.guide)
+    unknown = times(math.nan, needle.boundary.guide)
     while some(live):
         end = _end_of_part(w, needle, advance, done)
         spun = (end - done) * spin
         boundary = _move_boundary(needle.boundary, command, end - done, roll + spun)
         cut = Cut(needle.solution.tip, needle.channel, spun)
         moved = select(live, NeedleState(boundary, cut, needle.channel, needle.solution), needle)
-        needle, near = settle_needles(w, moved, free, live, near)
+        needle, near = settle_needles(w, moved, Held(unknown, unknown), live, near)
         residual = select(live, most(residual, needle.solution.residual), residual)
         converged = select(live, converged * needle.solution.converged, converged)
         roll = 0.0 * roll

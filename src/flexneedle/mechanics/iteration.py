@@ -13,7 +13,7 @@ from flexneedle.mechanics.compile import inner
 from flexneedle.mechanics.contact import contact_weight
 from flexneedle.mechanics.lanes import least, load, root, select, some
 from flexneedle.mechanics.lateral import Lateral, dot, size, square
-from flexneedle.mechanics.needle import Boundary, Cut, Path
+from flexneedle.mechanics.needle import Boundary, Cut, Held, Path
 from flexneedle.mechanics.work import Needles, X
 
 
@@ -32,7 +32,7 @@ class Iteration(NamedTuple):
     cut: Cut
     path: Path
     coupled: bool  # whether shortening and end of the path are unknown
-    held: Lateral  # essential y of the tip (mm), NaN where it is free
+    held: Held  # conditions of the tip
     live: bool  # needles that still search
     tip_x: float
     spans: Spans

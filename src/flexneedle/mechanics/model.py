@@ -89,9 +89,7 @@ def tissue_layers(
     its table along the channel (default: the same).
     """
     end, along = np.append(np.cumsum(thickness[:-1]), np.inf), law if channel is None else channel
-    return records(
-        LAYER, end=end, height=height, stiffness=modulus * width / height, law=law, channel=along
-    )
+    return records(LAYER, end=end, height=height, stiffness=modulus * width / height, law=law, channel=along)
 
 
 def contact_nodes(

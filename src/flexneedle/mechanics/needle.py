@@ -68,11 +68,19 @@ class Iterate(NamedTuple):
     guide: Bearing  # the needle in its guide
 
 
+class Held(NamedTuple):
+    """Essential conditions of the tip: y (mm), and slope if y is held, too; NaN where it is free."""
+
+    y: Lateral
+    slope: Lateral
+
+
 class Loads(NamedTuple):
-    """Lateral force on the tip (N), reaction of a held tip, shear and moment (N·mm) of the needle at the base."""
+    """Lateral force on the tip (N), reaction and couple (N·mm) of a held tip, shear and moment at the base."""
 
     tip: Lateral
     reaction: Lateral
+    couple: Lateral
     shear: Lateral
     moment: Lateral
 
@@ -112,7 +120,7 @@ def start(base: NodePose, tip: NodePose, bevel: Lateral, guide: Lateral) -> Need
     solution = Equilibrium(
         tip,
         Iterate(none, 0.0, Bearing(none, 0.0, none, none)),
-        Loads(none, none, none, none),
+        Loads(none, none, none, none, none),
         behind=0.0,
         iterations=0.0,
         residual=0.0,
@@ -123,7 +131,7 @@ def start(base: NodePose, tip: NodePose, bevel: Lateral, guide: Lateral) -> Need
 
 # ---- a needle as a row of numbers: its reals, then its laterals with one number an axis
 
-REALS, LATERALS = 12, 19
+REALS, LATERALS = 12, 20
 BEHIND = 8
 """Place of the number of nodes behind the tip."""
 
@@ -141,7 +149,7 @@ def apart(needle: NeedleState) -> tuple[tuple[float, ...], tuple[Lateral, ...]]:
     laterals = (
         base.y, base.slope, boundary.guide, boundary.bevel, boundary.load, begun.y, begun.slope,
         cut.channel.rest, channel.rest, tip.y, tip.slope, last.spring, guide.wall, guide.y, guide.force,
-        loads.tip, loads.reaction, loads.shear, loads.moment,
+        loads.tip, loads.reaction, loads.couple, loads.shear, loads.moment,
     )  # fmt: skip
     return reals, laterals
 
@@ -153,7 +161,8 @@ def together(reals: tuple[float, ...], laterals: tuple[Lateral, ...]) -> NeedleS
         reals
     )
     base_y, base_slope, guide, bevel, load, begun_y, begun_slope, cut_rest, rest = laterals[:9]
-    tip_y, tip_slope, spring, wall, guide_y, guide_force, force, reaction, shear, moment = laterals[9:]
+    tip_y, tip_slope, spring, wall, guide_y, guide_force, force, reaction, couple = laterals[9:18]
+    shear, moment = laterals[18:]
     return NeedleState(
         Boundary(NodePose(base_x, base_y, base_slope), guide, bevel, load),
         Cut(NodePose(begun_x, begun_y, begun_slope), CutChannel(cut_front, cut_rest), spin),
@@ -161,7 +170,7 @@ def together(reals: tuple[float, ...], laterals: tuple[Lateral, ...]) -> NeedleS
         Equilibrium(
             NodePose(tip_x, tip_y, tip_slope),
             Iterate(spring, shortening, Bearing(wall, give, guide_y, guide_force)),
-            Loads(force, reaction, shear, moment),
+            Loads(force, reaction, couple, shear, moment),
             behind,
             iterations,
             residual,

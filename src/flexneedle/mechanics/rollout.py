@@ -14,7 +14,7 @@ from flexneedle.mechanics.insertion import advance_needles, settle_needles
 from flexneedle.mechanics.iteration import count_before
 from flexneedle.mechanics.lanes import fill, lanes_of, least, load, load_all, most, select, some, spill
 from flexneedle.mechanics.lateral import Lateral, axes_of, dot, size, square, times, y_of, z_of
-from flexneedle.mechanics.needle import LATERALS, REALS, NeedleState, apart, together
+from flexneedle.mechanics.needle import LATERALS, REALS, Held, NeedleState, apart, together
 from flexneedle.mechanics.spring import spring_energy
 
 from flexneedle.mechanics.work import (  # isort: skip
@@ -273,8 +273,8 @@ def rollout(
     """Run sequences first to last − 1 (multiples of the lanes) of `commands` (N, m, 9), and fill `out`.
 
     model_of, state_of, sequence (N,): constants and state of each, and its own number. axes (N, 2, axes): y at x = 0
-    (mm) and slope of the line from which deflections count. held (N, axes): without commands, m = 0, the needles are
-    settled, with the tip at this y (mm), or free where it is NaN.
+    (mm) and slope of the line from which deflections count. held (N, 2, axes): without commands, m = 0, the needles are
+    settled, with the tip at this y (mm) and slope, or free where they are NaN.
     """
     steps = commands.shape[1]
     ends, curves = out.solution.size > 0, out.curves.size > 0
@@ -293,8 +293,10 @@ def rollout(
             needle, near = advance_needles(w, needle, space.command, near)
             _spill_step(w, space, needle, _count(w, needle, near), out, j, k, steps - k)
         if steps == 0:
-            fill(space.axis, 0, 0, held, sequence, j, 0)
+            fill(space.axis, 0, 0, held, sequence, j, 0, 0)
+            fill(space.axis, 0, 1, held, sequence, j, 1, 0)
             live = needle.solution.tip.x == needle.solution.tip.x
-            needle, near = settle_needles(w, needle, load(space.axis, 0, 0), live, near)
+            tip = Held(load(space.axis, 0, 0), load(space.axis, 0, 1))
+            needle, near = settle_needles(w, needle, tip, live, near)
         if ends:
             _spill_ends(w, needle, _count(w, needle, near), out, j)

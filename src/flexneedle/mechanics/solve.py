@@ -12,7 +12,17 @@ from flexneedle.mechanics.contact import contact_law, contact_weight
 from flexneedle.mechanics.iteration import Iteration, count_before, count_behind, find_spans
 from flexneedle.mechanics.lanes import least, load, magnitude, most, opposite, select, some, store
 from flexneedle.mechanics.lateral import Lateral, direction, dot, product, size, stretch, times, y_of
-from flexneedle.mechanics.needle import Bearing, Boundary, Cut, Equilibrium, Iterate, Loads, NodePose, Path
+from flexneedle.mechanics.needle import (
+    Bearing,
+    Boundary,
+    Cut,
+    Equilibrium,
+    Held,
+    Iterate,
+    Loads,
+    NodePose,
+    Path,
+)
 from flexneedle.mechanics.spring import spring_law, spring_rest
 from flexneedle.mechanics.sweep_back import Right, sweep_back
 from flexneedle.mechanics.sweep_out import Tip, solve_tip, sweep_out
@@ -179,7 +189,7 @@ def _iterate(w: Needles, it: Iteration, at: Iterate) -> _NewtonStep:
     return _NewtonStep(
         NodePose(it.tip_x, tip.y, tip.slope),
         Iterate(spring, base.shortening, guide),
-        Loads(tip.force, tip.reaction, base.shear, base.moment),
+        Loads(tip.force, tip.reaction, tip.couple, base.shear, base.moment),
         select(full, base.error, math.inf),
         agrees,
     )
@@ -201,7 +211,7 @@ def _accept(w: Needles, it: Iteration, fraction: float) -> None:
 @inner
 def _slide(it: Iteration, tip: NodePose, slide: float) -> NodePose:
     """Return the tip moved along its own line to its depth; a held tip keeps its y."""
-    slope = select(y_of(it.held) == y_of(it.held), times(0.0, tip.slope), tip.slope)
+    slope = select(y_of(it.held.y) == y_of(it.held.y), times(0.0, tip.slope), tip.slope)
     return NodePose(tip.x + slide, tip.y + times(slide, slope), tip.slope)
 
 
@@ -239,9 +249,9 @@ def _conclude(
 
 @inner
 def solve(
-    w: Needles, boundary: Boundary, cut: Cut, last: Equilibrium, held: Lateral, live: bool, near: int
+    w: Needles, boundary: Boundary, cut: Cut, last: Equilibrium, held: Held, live: bool, near: int
 ) -> tuple[Solution, int]:
-    """Find the equilibrium of the `live` needles; a `held` tip y (mm, NaN if free) is an essential condition.
+    """Find the equilibrium of the `live` needles; what of the tip is `held` is an essential condition.
 
     The shortening and the end of the path being cut are found with it. Where that does not converge, both are taken
     from the start of the step: the remaining problem is the minimum of a convex energy, found with a line search.

@@ -181,7 +181,7 @@ def sweep_back(w: Needles, it: Iteration, tip: Tip) -> Right:
     Returns the needle at the base.
     """
     zero, spans, base = 0.0 * it.tip_x, it.spans, it.boundary.base
-    right = Right(it.tip_x, tip.slope, tip.force, times(0.0, tip.force), zero, tip.error, tip.fraction)
+    right = Right(it.tip_x, tip.slope, tip.force, tip.couple, zero, tip.error, tip.fraction)
     right = _pass_nodes(w, it, tip.y, spans.last, spans.behind, right)
     for i in range(spans.last - 1, spans.first - 1, -1):
         right = _pass_contact(w, it, i, right)

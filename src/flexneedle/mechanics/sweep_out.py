@@ -65,6 +65,7 @@ class Tip(NamedTuple):
     force: Lateral
     spring: Lateral
     reaction: Lateral
+    couple: Lateral
     error: float
     fraction: float
 
@@ -225,7 +226,7 @@ def solve_tip(w: Needles, it: Iteration, u: Lateral, left: Left, follow: Follow)
 
     The two stiffnesses of the tip spring, along its compression and across it, are both exact.
     """
-    _, a1, a2, b11, b12, _ = left
+    _, a1, a2, b11, b12, b22 = left
     g1, g2 = follow
     fixed, slope = spring_rest(w, it.boundary.bevel, it.cut, it.path, it.tip_x)
     secant, tangent, sharpness, height = spring_law(w, it.cut.channel.front, it.tip_x, u)
@@ -239,14 +240,22 @@ def solve_tip(w: Needles, it: Iteration, u: Lateral, left: Left, follow: Follow)
         1.0 / (free + b11 * secant * slope),
     )
     total = at_zero - stretch(along, y, tangent * slope, secant * slope)
-    reaction = times(0.0, y)
-    held = y_of(it.held) == y_of(it.held)
+    reaction = couple = times(0.0, y)
+    held = y_of(it.held.y) == y_of(it.held.y)
     if some(held):
-        y = select(held, it.held, y)
-        needed = times(1.0 / b11, y - a1 - times(g1, y))
+        y = select(held, it.held.y, y)
+        off = y - a1 - times(g1, y)
+        needed = times(1.0 / b11, off)
+        turned = held & (y_of(it.held.slope) == y_of(it.held.slope))
+        if some(turned):
+            off_slope = it.held.slope - a2 - times(g2, y)
+            inverse = 1.0 / select(turned, b11 * b22 - b12 * b12, 1.0)
+            needed = select(turned, times(inverse, times(b22, off) - times(b12, off_slope)), needed)
+            couple = select(turned, times(inverse, times(b11, off_slope) - times(b12, off)), couple)
         more = needed - at_zero + stretch(along, y, tangent * slope, secant * slope)
         total, reaction = select(held, needed, total), select(held, more, reaction)
     new_u = times(slope, y) - fixed
     error, fraction = judge(height, sharpness, 0.0 * sharpness, u, new_u)
     error, fraction = select(secant > 0.0, error, 0.0), select(secant > 0.0, fraction, 1.0)
-    return Tip(y, a2 + times(g2, y) + times(b12, total), total, new_u, reaction, error, fraction)
+    tip_slope = a2 + times(g2, y) + times(b12, total) + times(b22, couple)
+    return Tip(y, tip_slope, total, new_u, reaction, couple, error, fraction)

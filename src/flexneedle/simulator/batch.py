@@ -45,7 +45,7 @@ def run(
 
     model_of, state_of (N,): places of the constants and the start of each sequence. axes (N, 2, axes): lines from which
     deflections count. every_step, at_end: names of `COLUMNS`, of each step or of the last alone. ends: whether the
-    states at the end are wanted. held (N, axes): tip positions without commands, m = 0.
+    states at the end are wanted. held (N, 2, axes): y (mm) and slope of tips without commands, m = 0.
     """
     count, steps = commands.shape[:2]
     size = -(-count // WIDTH) * WIDTH
@@ -54,7 +54,7 @@ def run(
     out = _make_outputs(size, steps, n, across, kept, ends)
     sequence = np.minimum(np.arange(size), count - 1)
     who = model_of[sequence], state_of[sequence], sequence
-    tips = np.full((count, across), np.nan) if held is None else held
+    tips = np.full((count, 2, across), np.nan) if held is None else held
 
     def part(first: int, last: int) -> None:
         space = _workspace(n, models.layers.shape[1], across)

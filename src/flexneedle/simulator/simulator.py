@@ -42,6 +42,7 @@ from flexneedle.types import COLUMNS, Control, Floats
 
 _MECHANICS = ("needle", "setup", "entry", "tissue", "contact")  # the sections that a state depends on
 _CLOSEST_POINTS_MM = 0.1
+_PLACINGS = 3  # of a base, until the tip is at a given depth
 _ALL_CORES = "leave it out for one per core"
 
 
@@ -83,25 +84,58 @@ class Simulator:
         """Compile the kernels, or load them from the cache, ahead of the first call of each."""
         self.rollout(self.start(), controls(1, 1), at_end=("shapes",))
 
-    def start(self, roll: float = 0.0) -> State:
-        """Return the straight needle in air, `setup.tip_to_skin_mm` before the skin, rolled by `roll` (rad)."""
+    def start(
+        self, roll: float = 0.0, tip: Sequence[float] | None = None, slope: Sequence[float] | None = None
+    ) -> State:
+        """Return the straight needle in air, rolled by `roll` (rad), with base and guide on its line.
+
+        Args:
+            roll: Angle of the needle.
+            tip: Measured x, y and, in space, z (mm) of the tip before the skin (default: as in the scenario).
+            slope: Measured slope dy/dx and, in space, dz/dx (default: as in the scenario).
+        """
         self._limits.check(np.zeros(MOVES), controls(1, roll=roll))
-        one: Lateral = 1.0 if self.scenario.setup.axes == 1 else 1.0 + 0.0j
+        setup, entry, axes = self.scenario.setup, self.scenario.entry, self.scenario.setup.axes
+        one: Lateral = 1.0 if axes == 1 else 1.0 + 0.0j
 
         def across(value: complex) -> Lateral:
-            return complex(value) if self.scenario.setup.axes == 2 else value.real
+            return complex(value) if axes == 2 else value.real
 
-        bevel, entry = rotate(roll, one), self.scenario.entry
-        slope = across(entry.slope)
-        base, tip = (
-            nd.NodePose(x, across(entry.lateral(x)), slope)
-            for x in (self.scenario.start_base_x, self.scenario.setup.start_tip_x)
+        tilt = across(entry.slope) if slope is None else _slope(slope, axes)
+        x, y = setup.start_tip_x, entry.lateral(setup.start_tip_x)
+        if tip is not None:
+            x, *measured = _point(tip, axes)
+            y = complex(*measured)
+            if not x <= 0.0:
+                rule = "must be at most 0: the needle starts before the skin"
+                raise CommandError("measured tip x", x, 0.0, rule)
+        base_x = self.scenario.start_base_x
+        if tip is not None:
+            base_x = x - self.scenario.needle.length_mm / (1.0 + 0.5 * abs(tilt) ** 2)  # it keeps its length
+        base = nd.NodePose(base_x, across(y + tilt * (base_x - x)), tilt)
+        guide = across(self.scenario.guide_home)
+        if setup.guide_x is not None and not (tip is None and slope is None):
+            guide = across(y + tilt * (setup.guide_x - x))
+        needle = nd.start(base, nd.NodePose(x, across(y), tilt), rotate(roll, one), guide)
+        unsolved = Solved.unsolved(needle, self._model.nodes.size, axes)
+        state = State(
+            self.scenario,
+            self._model,
+            nd.NodePose(base_x - self.scenario.start_base_x, base.y, tilt),
+            float(roll),
+            unsolved,
         )
-        needle = nd.start(base, tip, bevel, across(self.scenario.guide_home))
-        clamp = nd.NodePose(0.0, base.y, slope)
-        unsolved = Solved.unsolved(needle, self._model.nodes.size, self.scenario.setup.axes)
-        state = State(self.scenario, self._model, clamp, float(roll), unsolved)
         return self._settle(state, self._model)
+
+    def advance_to(self, state: State, depth: float) -> State:
+        """Return the state after an advance or withdrawal of the base that brings the tip to a depth (mm)."""
+        done, most = state, self.scenario.setup.max_advance_mm
+        travel = depth - float(state.tip[0])
+        for _ in range(_PLACINGS):
+            steps = max(1, int(np.ceil(abs(travel) / most)))
+            done, _ = self.replay(state, controls(1, steps, db_x=travel / steps)[0])
+            travel += depth - float(done.tip[0])
+        return done
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
@@ -228,18 +262,23 @@ class Simulator:
                 own.check(travel, few, state.roll)
 
     def assimilate(
-        self, state: State, tip: Sequence[float], points: Sequence[Sequence[float]] = ()
+        self,
+        state: State,
+        tip: Sequence[float],
+        points: Sequence[Sequence[float]] = (),
+        slope: Sequence[float] | None = None,
     ) -> Assimilation:
-        """Hold the tip at its measured lateral position, and the needle at further points, as essential conditions.
+        """Hold the tip at its measured pose, and the needle at further points, as essential conditions.
 
         The last step is solved again, so a contact that it cut is on the measured path. Axial motion is rigid: x is not
-        corrected, its innovation is returned. The next step releases the conditions; `state.reactions.tip_force` is the
-        force (N) on the tip beyond `state.tip_load`.
+        corrected, its innovation is returned. The next step releases the conditions; `state.reactions` has the force
+        (N) on the tip beyond `state.tip_load`, and the moment.
 
         Args:
             state: The state after the last step.
             tip: Measured x, y and, in space, z (mm).
             points: Measured points along the needle, as `tip`.
+            slope: Measured slope dy/dx of the tip and, in space, dz/dx (default: free).
         """
         self._check_mechanics(state)
         axes = self.scenario.setup.axes
@@ -252,10 +291,13 @@ class Simulator:
         order = 1 + np.argsort(measured[1:, 0])
         x = measured[order, 0]
         self._check_points(state, x)
-        after = self._assimilate(state, across[0].item(), x, across[order])
+        direction = None if slope is None else _slope(slope, axes)
+        after = self._assimilate(state, (across[0].item(), direction), x, across[order])
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
-    def _assimilate(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:
+    def _assimilate(
+        self, state: State, tip: tuple[Lateral, Lateral | None], x: Floats, y: nd.Laterals
+    ) -> State:
         place = self._model.nodes["x"].searchsorted(x)
         merged = self._model._replace(nodes=insert_essential(self._model.nodes, x))
         solved = state.solved
@@ -264,7 +306,7 @@ class Simulator:
             rest=np.insert(solved.rest, place, nd.to_parts(y, self.scenario.setup.axes), axis=0),
             compression=np.insert(solved.compression, place, 0.0, axis=0),
         )
-        return self._settle(replace(state, solved=more), merged, tip_y)
+        return self._settle(replace(state, solved=more), merged, tip)
 
     def _check_points(self, state: State, x: Floats) -> None:
         guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
@@ -282,11 +324,17 @@ class Simulator:
                 )
                 raise CommandError("measured point x", float(value), high, rule)
 
-    def _settle(self, state: State, merged: Model, held: Lateral | None = None) -> State:
-        """Return the state solved again, with nodes of the scenario or more, and the tip held at a y (mm)."""
+    def _settle(
+        self, state: State, merged: Model, held: tuple[Lateral, Lateral | None] | None = None
+    ) -> State:
+        """Return the state solved again, with nodes of the scenario or more, and the tip held: y (mm) and slope."""
         packed = self._packed if merged is self._model else pack([merged])
         none, axes = np.zeros(1, dtype=np.int64), self.scenario.setup.axes
-        tip = None if held is None else nd.to_parts(np.array([held]), axes)
+        tip = (
+            None
+            if held is None
+            else nd.to_parts(np.array([[np.nan if h is None else h for h in held]]), axes)
+        )
         rows, starts = np.zeros((1, 0, len(COLUMNS))), pack_states([state], merged.nodes.size)
         out = run(packed, none, starts, none, rows, self._no_lines, 1, ends=True, held=tip)
         solved = Solved.of(merged, out, 0).without_points(merged.nodes)
@@ -316,3 +364,13 @@ def _point(values: Sequence[float], axes: int) -> list[float]:
         rule = f"must be {1 + axes}, {', '.join('xyz'[: 1 + axes])} in mm"
         raise CommandError("coordinates of a measured point", len(values), 1 + axes, rule)
     return [float(value) for value in values]
+
+
+def _slope(values: Sequence[float], axes: int) -> Lateral:
+    """Return a measured slope; CommandError for another number of coordinates, or one that is not finite."""
+    if len(values) != axes:
+        rule = f"must be {axes}: dy/dx" + (" and dz/dx" if axes > 1 else "")
+        raise CommandError("coordinates of a measured slope", len(values), axes, rule)
+    if not np.isfinite(values).all():
+        raise CommandError("measured slope", float("nan"), 0.0, "must be finite")
+    return float(values[0]) if axes == 1 else complex(*values)

@@ -44,12 +44,13 @@ class Contacts(NamedTuple):
 
 
 class Reactions(NamedTuple):
-    """Reactions on the needle: lateral forces (N) and the clamp's moment (N·mm), 0 where nothing holds it."""
+    """Reactions on the needle: lateral forces (N) and moments (N·mm), 0 where nothing holds it."""
 
     base_force: Lateral
     base_moment: Lateral
     guide_force: Lateral
     tip_force: Lateral
+    tip_moment: Lateral
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +203,7 @@ class State:
         """Forces of clamp, guide and held tip on the needle."""
         loads = self.needle.solution.loads
         guide = self.mesh["force"][self.mesh["x"] == self.scenario.setup.guide_x]
-        forces = -loads.shear, -loads.moment, complex(guide.sum()), loads.reaction
+        forces = -loads.shear, -loads.moment, complex(guide.sum()), loads.reaction, loads.couple
         return Reactions(*map(_pair, forces))
 
     def with_estimate(
