@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -357,3 +357,24 @@ class CheckedMeasurement:
 
     measurement: Measurement
     verdict: Verdict
+
+
+class Law(Protocol):
+    """Radial compression of a tissue, scaled to the stiffness 1 at e = 0; functions of arrays of e in [0, limit]."""
+
+    @property
+    def limit(self) -> float:
+        """Relative compression up to which the law is valid, below 1."""
+        ...
+
+    def energy(self, e: Floats) -> Floats:
+        """Return w(e)."""
+        ...
+
+    def force(self, e: Floats) -> Floats:
+        """Return w′(e)."""
+        ...
+
+    def stiffness(self, e: Floats) -> Floats:
+        """Return w″(e)."""
+        ...

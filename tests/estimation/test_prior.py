@@ -46,6 +46,14 @@ def test_the_prior_is_taken_from_the_scenario():
     assert prior.cost(prior.mean + off) == pytest.approx(0.5 * off @ np.linalg.solve(covariance, off))
 
 
+@pytest.mark.parametrize(("known", "mean"), [(None, 0.08), (0.0, 0.0), (0.12, 0.12)])
+def test_the_clearance_of_the_model_is_the_mean_of_its_prior(known, mean):
+    values = {"setup.guide_clearance_mm": known, "control.adaptive_mpc.clearance_mm": 0.08}
+    scenario = PHANTOM.with_values(values)
+    prior = Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings, 40.0)
+    assert prior.mean[AT.clearance] == mean
+
+
 def test_cells_are_not_so_short_that_a_fit_would_never_end():
     short = begun_with(Simulator(PHANTOM.with_values({"control.adaptive_mpc.cell_mm": 1e-3}), 1))
     with pytest.raises(

@@ -21,7 +21,11 @@ SIZE = {"shear_modulus_kpa": 1e3 * MU, "compression_length_mm": HEIGHT, "engaged
 LIMIT = Ogden.limit
 
 alphas = st.one_of(st.floats(0.05, 30.0), st.floats(-30.0, -0.05))
-OWN = {"ogden": st.builds(dict, alpha=alphas), "linear": st.just({})}
+OWN = {
+    "ogden": st.builds(dict, alpha=alphas),
+    "linear": st.just({}),
+    "tearing": st.builds(dict, alpha=alphas, yield_mm=st.floats(0.3, 1.0)),
+}
 """Parameters of each law besides its stiffness and size."""
 layers = st.sampled_from(sorted(LAWS)).flatmap(
     lambda name: OWN[name].map(lambda own: LAWS[name](law=name, **own, **SIZE))

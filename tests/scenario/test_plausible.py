@@ -27,6 +27,7 @@ PHANTOM = load_scenario("phantom")
         ("tissue.0.engaged_width_mm", 0.0052, "231 times below"),
         ("tissue.0.thickness_mm", 0.02, "3.75 times below"),
         ("tissue.1.thickness_mm", 20.0, "has no effect: the last layer has no end"),
+        ("setup.guide_clearance_mm", 50.0, "167 times the largest usual value, 0.01 to 0.3 ("),
         ("setup.insertion_speed_mm_s", 5000.0, "17.9 times the largest"),
         ("setup.max_guide_travel_mm", 15000.0, "150 times the largest"),
         ("setup.max_base_travel_mm", 0.015, "66.7 times below"),
@@ -41,6 +42,12 @@ def test_an_implausible_value_is_one_line(key, value, doubt):
         f"{key.replace('.0.', '[0].').replace('.1.', '[1].')} = {value:g}{youngs}: {doubt}"
     )
     assert found.isprintable()
+
+
+def test_a_displacement_from_which_nothing_tears_is_in_doubt():
+    layer = PHANTOM.tissue[1].model_dump() | {"law": "tearing", "yield_mm": 14.0}
+    (found,) = find_doubts(PHANTOM.with_values({"tissue": [layer]}))
+    assert found.startswith("tissue[0].yield_mm = 14: 14 times the largest usual value, 0.3 to 1 (")
 
 
 def test_readings_that_arrive_stale_are_in_doubt():
@@ -74,7 +81,8 @@ def test_scenarios_of_the_package_raise_no_doubt():
 
 
 def test_every_range_names_its_source_and_a_key_of_scenarios():
-    tube = PHANTOM.with_values({"needle.inner_diameter_mm": 0.5, "phantom.structure.alpha": 3.0})
+    more = {"needle.inner_diameter_mm": 0.5, "phantom.structure.alpha": 3.0, "setup.guide_clearance_mm": 0.05}
+    tube = PHANTOM.with_values(more | {"tissue.0.law": "tearing", "tissue.0.yield_mm": 0.5})
     keys = {key.replace("tissue.0", "tissue.*") for key in tube.flat()}
     assert set(USUAL) <= keys
     assert all(usual.low < usual.high and usual.source for usual in USUAL.values())

@@ -100,8 +100,8 @@ def test_order_of_measured_points_does_not_matter(state):
 @pytest.mark.parametrize(
     ("tip", "points", "name"),
     [
-        ((30.0, np.nan), [], "measured position"),
-        ((30.0, 1.0), [(5.0, np.inf)], "measured position"),
+        ((30.0, np.nan), [], "measured point"),
+        ((30.0, 1.0), [(5.0, np.inf)], "measured point"),
         ((30.0, 1.0), [(-41.05, 0.0)], "measured point x"),
         ((30.0, 1.0), [(40.0, 0.0)], "measured point x"),
         ((30.0, 1.0), [(5.0, 0.0), (5.01, 0.0)], "measured point x"),
@@ -122,13 +122,14 @@ poses = st.tuples(*[st.floats(-bound, bound) for bound in (1.5, 1.5, 0.03, 0.03)
 @given(pose=poses, ahead=st.floats(0.0, 20.0))
 def test_a_needle_in_air_starts_straight_at_the_measured_pose_of_its_tip(pose, ahead):
     """Base and guide are on its line, so that nothing bends it; only the guide is off its home."""
-    simulator = Simulator(SPACE)
+    simulator = Simulator(SPACE.with_values({"entry.slope_mrad": 20.0}))
     state = simulator.start(0.0, (-ahead, *pose[:2]), pose[2:])
     x, line = state.nodes[:, 0], state.nodes[:, 1:3]
     np.testing.assert_allclose(line, np.add(pose[:2], np.outer(x + ahead, pose[2:])), atol=1e-4)
     np.testing.assert_allclose(state.tip, [-ahead, *pose], atol=1e-6)
     np.testing.assert_allclose(state.reactions.guide_force, 0.0, atol=1e-5)
-    np.testing.assert_allclose(state.travel[:5], 0.0, atol=1e-9)
+    np.testing.assert_allclose(state.travel[1:5], 0.0, atol=1e-9)
+    assert state.travel[0] == pytest.approx(28.5 - ahead, abs=0.2)  # so the stroke ends at the same depth
 
 
 def test_a_needle_that_starts_as_in_the_scenario_is_where_the_scenario_has_it():
@@ -137,17 +138,54 @@ def test_a_needle_that_starts_as_in_the_scenario_is_where_the_scenario_has_it():
     np.testing.assert_allclose(given.nodes, simulator.start(0.4).nodes, atol=1e-12)
 
 
-def test_a_tip_in_tissue_is_no_start():
-    with pytest.raises(CommandError, match=r"measured tip x = 2.*before the skin"):
-        SIMULATOR.start(0.0, (2.0, 0.0), (0.0,))
-    with pytest.raises(CommandError, match=r"coordinates of a measured slope"):
-        SIMULATOR.start(0.0, (-2.0, 0.0), (0.0, 0.0))
+def test_a_needle_of_which_the_slope_alone_is_measured_keeps_the_tip_of_the_scenario():
+    state = SIMULATOR.start(slope=(0.02,))
+    np.testing.assert_allclose(state.tip, [-28.5, 0.0, 0.0, 0.02, 0.0], atol=1e-6)
+    assert state.guide[0] == pytest.approx(-0.02 * 12.5)
 
 
-@pytest.mark.parametrize("depth", [33.7, 30.02, 12.5])
-def test_the_tip_is_advanced_to_a_depth(state, depth):
+@pytest.mark.parametrize(
+    ("tip", "slope", "message"),
+    [
+        ((2.0, 0.0), (0.0,), r"measured tip x = 2: must be at most 0, before the skin and past the guide"),
+        ((-41.5, 0.0), (0.0,), r"measured tip x = -41.5: .* past the guide \(-41\)"),
+        ((-2.0, np.nan), None, r"measured point = nan: must be finite"),
+        ((-2.0,), None, r"coordinates of a measured point = 1: must be 2, x, y in mm"),
+        ((-2.0, 0.0), (0.0, 0.0), r"coordinates of a measured slope = 2: must be 1: dy/dx"),
+        (None, (0.21,), r"measured slope = 0.21: must be at most 0.2 in size"),
+        (None, (np.inf,), r"measured slope = inf: must be finite"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(tip, slope, message):
+    with pytest.raises(CommandError, match=message):
+        SIMULATOR.start(0.0, tip, slope)
+
+
+@pytest.mark.parametrize("slope", [(np.nan,), (0.0, 0.0)])
+def test_an_impossible_slope_is_refused(state, slope):
+    with pytest.raises(CommandError, match="measured slope"):
+        SIMULATOR.assimilate(state, state.tip[:2], slope=slope)
+
+
+@pytest.mark.parametrize("depth", [-28.6, 81.6, np.nan, np.inf])
+def test_a_depth_outside_the_stroke_is_refused(state, depth):
+    with pytest.raises(CommandError, match=r"depth = .*must be from -28.5 to 81.5, within the stroke"):
+        SIMULATOR.advance_to(state, depth)
+
+
+def test_a_depth_that_a_bent_needle_does_not_reach_is_refused(state):
+    """A withdrawn needle with the guide far off its axis snaps out of the last of the tissue (theory, 12)."""
+    bent, _ = SIMULATOR.replay(state, [Control(dg_y=8.0)])
+    with pytest.raises(CommandError, match=r"depth = 0.1: .* the needle is bent too far"):
+        SIMULATOR.advance_to(bent, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("guide", "depth"), [(0.5, 33.7), (0.5, 30.02), (0.5, 12.5), (6.0, 12.5), (11.0, 80.0)]
+)
+def test_the_tip_is_advanced_to_a_depth(state, depth, guide):
     """Also where the needle has become shorter along its axis since a guide has bent it."""
-    bent = SIMULATOR.step(state, Control(dg_y=0.5))
+    bent, _ = SIMULATOR.replay(state, [Control(dg_y=guide)])
     reached = SIMULATOR.advance_to(bent, depth)
-    assert reached.tip[0] == pytest.approx(depth, abs=1e-5)
+    assert reached.tip[0] == pytest.approx(depth, abs=1e-6)
     assert reached.converged

@@ -15,12 +15,14 @@ from reference.cases import insert_to, repeat, tight
 
 PHANTOM = load_scenario("phantom").with_values({"setup.max_base_turn_step_mrad": 50.0})
 SIMULATOR = tight(PHANTOM)
-MOVES = {  # base y, base turn, guide y, held tip y: mm and rad in all
-    "base": (2.0, 0.0, 0.0, 0.0),
-    "turn": (0.0, 0.02, 0.0, 0.0),
-    "guide": (0.0, 0.0, 2.0, 0.0),
-    "tip": (0.0, 0.0, 0.0, 1.5),
-    "all": (2.0, -0.016, -1.4, 1.0),
+MOVES = {  # base y, base turn, guide y, held tip y, held slope of the tip: mm and rad in all
+    "base": (2.0, 0.0, 0.0, 0.0, 0.0),
+    "turn": (0.0, 0.02, 0.0, 0.0, 0.0),
+    "guide": (0.0, 0.0, 2.0, 0.0, 0.0),
+    "tip": (0.0, 0.0, 0.0, 1.5, 0.0),
+    "all": (2.0, -0.016, -1.4, 1.0, 0.0),
+    "slope": (0.0, 0.0, 0.0, 0.0, 0.03),
+    "pose": (1.0, 0.0, -1.4, 1.0, -0.03),
 }
 
 
@@ -33,7 +35,7 @@ def withdrawn(by):
 
 
 def lateral_forces(state):
-    """Return the work-conjugates of base y, base turn, guide y, held tip y."""
+    """Return the work-conjugates of base y, base turn, guide y, held tip y, held slope of the tip."""
     return np.array(state.reactions)[:, 0]
 
 
@@ -48,6 +50,7 @@ def axial_force(state):
         (energy[growing] / behind[growing]).sum()
         + spring
         - state.needle.solution.loads.tip * state.tip[THETA]
+        - state.needle.solution.loads.couple**2 / (2 * PHANTOM.needle.bending_stiffness)
     )
 
 
@@ -59,15 +62,16 @@ def base_axial_force(state):
 
 def travel(state, move, advance=0.0, steps=60):
     """(lateral work, axial work, change of energy) over a move, by the trapezoid rule."""
-    held = state.tip[1] if move[3] else None
-    energy, lateral, axial = state.energy, 0.0, 0.0
-    db_y, db_theta, dg_y, dtip = np.array(move) / steps
+    held, energy, lateral, axial = state.tip[[1, THETA]], state.energy, 0.0, 0.0
+    each = np.array(move) / steps
+    db_y, db_theta, dg_y = each[:3]
     for _ in range(steps):
         after = SIMULATOR.step(state, Control(db_x=advance / steps, db_y=db_y, db_theta=db_theta, dg_y=dg_y))
-        if held is not None:
-            held += dtip
-            after = SIMULATOR.assimilate(after, (after.tip[0], held)).state
-        lateral += (lateral_forces(state) + lateral_forces(after)) @ [db_y, db_theta, dg_y, dtip] / 2
+        if any(move[3:]):
+            held = held + each[3:]
+            slope = held[1:] if move[4] else None
+            after = SIMULATOR.assimilate(after, (after.tip[0], held[0]), slope=slope).state
+        lateral += (lateral_forces(state) + lateral_forces(after)) @ each / 2
         slide = after.tip[0] - state.tip[0]
         axial += (axial_force(state) + axial_force(after)) * slide / 2
         axial += (base_axial_force(state) + base_axial_force(after)) * advance / steps / 2
@@ -80,6 +84,14 @@ def travel(state, move, advance=0.0, steps=60):
 def first_hold(state):
     """The state with its tip held where it is."""
     return SIMULATOR.assimilate(state, state.tip[:2]).state
+
+
+@pytest.mark.parametrize("name", ["slope", "pose"])
+def test_work_of_a_held_slope_is_the_energy_stored(name):
+    """Its moment turns the tip."""
+    lateral, axial, stored = travel(first_hold(withdrawn(3.55)), MOVES[name])
+    assert abs(stored) > 0.02
+    assert lateral + axial == pytest.approx(stored, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ["tip", "all"])
@@ -104,7 +116,9 @@ def test_work_of_drawing_back_is_the_energy_released():
     """An axial move, through points that lose weight and a spring that fades, with the base moving laterally."""
     errors = []
     for steps in (100, 400):
-        lateral, axial, stored = travel(withdrawn(0.4), (2.0, -0.016, -1.4, 0.0), advance=-2.0, steps=steps)
+        lateral, axial, stored = travel(
+            withdrawn(0.4), (2.0, -0.016, -1.4, 0.0, 0.0), advance=-2.0, steps=steps
+        )
         errors.append(abs((lateral + axial) / stored - 1))
     assert abs(axial) > 0.05 * abs(stored)
     assert errors[1] < 2e-3

@@ -95,12 +95,18 @@ def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[
 
 
 def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the schema of the table, or list of tables, of a key; None for a value."""
+    """Return the schema of the table, or list of tables, of a key, with the keys of all choices; None for a value."""
     items = value.get("items", {})
     either = value.get("anyOf", [])
     choices = [value, items, *items.get("anyOf", []), *either, *(each.get("items", {}) for each in either)]
     names = [choice["$ref"].rsplit("/", 1)[1] for choice in choices if "$ref" in choice]
-    return known[names[0]] if names else None
+    if not names:
+        return None
+    first, *others = (known[name] for name in names)
+    more = {key: schema for other in others for key, schema in other["properties"].items()}
+    return first | {
+        "properties": first["properties"] | {k: v for k, v in more.items() if k not in first["properties"]}
+    }
 
 
 def section(table: Table, title: str, advice: dict[str, Any]) -> str:

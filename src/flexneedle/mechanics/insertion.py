@@ -6,7 +6,7 @@ from flexneedle.mechanics.compile import inner, shared
 from flexneedle.mechanics.contact import contact_rest
 from flexneedle.mechanics.iteration import count_before
 from flexneedle.mechanics.lanes import least, load, most, select, some, store, whole
-from flexneedle.mechanics.lateral import Lateral, lateral, rotate, times
+from flexneedle.mechanics.lateral import lateral, rotate, times
 from flexneedle.mechanics.needle import Boundary, Cut, CutChannel, Equilibrium, Held, NeedleState, NodePose
 from flexneedle.mechanics.solve import Solution, solve
 from flexneedle.mechanics.spring import spring_rest

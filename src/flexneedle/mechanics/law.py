@@ -11,15 +11,13 @@ in cells: its `place` in the table of the law.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.mechanics.compile import inner
 from flexneedle.mechanics.lanes import ROW, opposite, row_of, select, some, whole
-
-Floats = NDArray[np.float64]
+from flexneedle.types import Floats, Law
 
 CELLS = 256
 DEGREE = 5
@@ -29,27 +27,6 @@ ROWS = CELLS + 1
 _ENERGY, _SHARPNESS = DEGREE + 1, DEGREE + 2
 # Of the row after the cells: limit, w′, w″, w there; 1/width of a cell.
 _LIMIT, _FORCE, _STIFFNESS, _STORED, PER_UNIT = range(5)
-
-
-class Law(Protocol):
-    """Radial compression of a tissue, scaled to the stiffness 1 at e = 0; functions of arrays of e in [0, limit]."""
-
-    @property
-    def limit(self) -> float:
-        """Relative compression up to which the law is valid, below 1."""
-        ...
-
-    def energy(self, e: Floats) -> Floats:
-        """Return w(e)."""
-        ...
-
-    def force(self, e: Floats) -> Floats:
-        """Return w′(e)."""
-        ...
-
-    def stiffness(self, e: Floats) -> Floats:
-        """Return w″(e)."""
-        ...
 
 
 class Response(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.tissue.ogden import Ogden
+from flexneedle.scenario.tissue.ogden import OneTermOgden
 from flexneedle.types import Point
 
 _THINNEST_PIECE_MM = 1e-3  # least thickness of a piece of a layer that a hidden layer splits
@@ -231,7 +231,7 @@ def structure_values(scenario: Scenario) -> dict[str, Any]:
     for k, layer in enumerate(scenario.tissue):
         length = structure.compression_length_factor * layer.compression_length_mm
         values[f"tissue.{k}.compression_length_mm"] = length
-        if structure.alpha is not None and isinstance(layer, Ogden):
+        if structure.alpha is not None and isinstance(layer, OneTermOgden):
             values[f"tissue.{k}.alpha"] = structure.alpha
     return values
 

@@ -63,7 +63,7 @@ class Plant(Protocol):
 class ModelPlant:
     """The controller's type of model with the true parameters and a finer mesh.
 
-    Without initial bend, guide clearance, friction, and variation of stiffness along the depth.
+    Without initial bend, friction, and variation of stiffness along the depth; with the model's guide clearance.
     """
 
     def __init__(self, truth: Truth, roll: float) -> None:

@@ -6,10 +6,11 @@ tissue.
 
 from collections.abc import Sequence
 
-from flexneedle.mechanics.law import Law, tables
+from flexneedle.mechanics.law import tables
 from flexneedle.mechanics.model import Model, with_channel_laws
 from flexneedle.scenario.tissue.layer import Layer, all_laws
 from flexneedle.scenario.tissue.torn import TornLaw
+from flexneedle.types import Law
 
 
 def channel_laws(tissue: Sequence[Layer], yield_mm: float | None) -> tuple[Sequence[Law], Sequence[int]]:

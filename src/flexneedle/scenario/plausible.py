@@ -60,12 +60,18 @@ USUAL = {
         70,
         "our estimate: 0.25 to 0.7 times the compression length, Vesic's stiffness (1961) to about twice it",
     ),
+    "tissue.*.yield_mm": Range(
+        0.3, 1, "0.5 fitted to recorded insertions in gel (docs/worlds.md); the ends are our estimate"
+    ),
     "target.depth_mm": Range(
         4,
         200,
         "pen needles 4, lumbar puncture 20 to 130 (Am J Emerg Med 2005;23:742), brachytherapy needles 200",
     ),
     "setup.guide_to_skin_mm": Range(5, 200, "41 in the paper; the ends are our estimate"),
+    "setup.guide_clearance_mm": Range(
+        0.01, 0.3, "our estimate, from a sliding fit to a guide of the next gauge"
+    ),
     "setup.tip_to_skin_mm": Range(1, 200, "28.5 in the paper; the ends are our estimate"),
     "setup.stroke_mm": Range(
         10, 200, f"110 in the paper, 150 for a robot ({_ROBOT}); the ends are our estimate"

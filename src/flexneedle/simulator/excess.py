@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.tissue.layer import laws_of
+from flexneedle.scenario.tissue.layer import all_laws
 from flexneedle.simulator.state import State
 from flexneedle.types import Floats
 
@@ -38,11 +38,12 @@ class LoadLimits:
     @staticmethod
     def of(scenario: Scenario) -> "LoadLimits":
         """Return the limits of a scenario."""
-        settings, laws = scenario.guard, laws_of(scenario.tissue)[0]
+        settings, (laws, place, channel) = scenario.guard, all_laws(scenario.tissue)
         least = settings.least_stretch
-        compression = [_SHARE_OF_LAW * law.limit if least is None else 1.0 - least for law in laws]
+        compression = np.array([_SHARE_OF_LAW * law.limit if least is None else 1.0 - least for law in laws])
+        compression[channel] = compression[place]  # tissue that tears may be compressed as if it were intact
         force = math.inf if settings.guide_force_n is None else settings.guide_force_n
-        return LoadLimits(np.array(compression), 1e-2 * settings.needle_strain_percent, force)
+        return LoadLimits(compression, 1e-2 * settings.needle_strain_percent, force)
 
     @property
     def values(self) -> dict[str, float]:

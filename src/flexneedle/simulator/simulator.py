@@ -14,7 +14,6 @@ from flexneedle.arguments import check_instance, check_whole
 from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.lateral import Lateral, rotate
 from flexneedle.mechanics.model import Adaptation, Model, adapt, check_adaptation, insert_essential, pack
 from flexneedle.mechanics.rollout import Models
 from flexneedle.scenario.files import load_scenario
@@ -37,12 +36,15 @@ from flexneedle.simulator.sequences import (
     pack_states,
     trajectories,
 )
+from flexneedle.simulator.start import measured_point, measured_slope, straight_needle
 from flexneedle.simulator.state import Solved, State
 from flexneedle.types import COLUMNS, Control, Floats
 
 _MECHANICS = ("needle", "setup", "entry", "tissue", "contact")  # the sections that a state depends on
 _CLOSEST_POINTS_MM = 0.1
-_PLACINGS = 3  # of a base, until the tip is at a given depth
+_PLACINGS = 12  # of a base, until the tip is at a given depth, to
+_PLACED_MM = 1e-6
+_SECANTS = 0.3, 3.0  # least and largest advance of the base for 1 mm of depth
 _ALL_CORES = "leave it out for one per core"
 
 
@@ -89,53 +91,44 @@ class Simulator:
     ) -> State:
         """Return the straight needle in air, rolled by `roll` (rad), with base and guide on its line.
 
+        The advance of the base counts from the start of the scenario, so the stroke ends at the same depth.
+
         Args:
             roll: Angle of the needle.
             tip: Measured x, y and, in space, z (mm) of the tip before the skin (default: as in the scenario).
             slope: Measured slope dy/dx and, in space, dz/dx (default: as in the scenario).
+
+        Raises:
+            CommandError: The tip is behind the guide or in tissue, or the slope is too steep.
         """
         self._limits.check(np.zeros(MOVES), controls(1, roll=roll))
-        setup, entry, axes = self.scenario.setup, self.scenario.entry, self.scenario.setup.axes
-        one: Lateral = 1.0 if axes == 1 else 1.0 + 0.0j
-
-        def across(value: complex) -> Lateral:
-            return complex(value) if axes == 2 else value.real
-
-        tilt = across(entry.slope) if slope is None else _slope(slope, axes)
-        x, y = setup.start_tip_x, entry.lateral(setup.start_tip_x)
-        if tip is not None:
-            x, *measured = _point(tip, axes)
-            y = complex(*measured)
-            if not x <= 0.0:
-                rule = "must be at most 0: the needle starts before the skin"
-                raise CommandError("measured tip x", x, 0.0, rule)
-        base_x = self.scenario.start_base_x
-        if tip is not None:
-            base_x = x - self.scenario.needle.length_mm / (1.0 + 0.5 * abs(tilt) ** 2)  # it keeps its length
-        base = nd.NodePose(base_x, across(y + tilt * (base_x - x)), tilt)
-        guide = across(self.scenario.guide_home)
-        if setup.guide_x is not None and not (tip is None and slope is None):
-            guide = across(y + tilt * (setup.guide_x - x))
-        needle = nd.start(base, nd.NodePose(x, across(y), tilt), rotate(roll, one), guide)
-        unsolved = Solved.unsolved(needle, self._model.nodes.size, axes)
-        state = State(
-            self.scenario,
-            self._model,
-            nd.NodePose(base_x - self.scenario.start_base_x, base.y, tilt),
-            float(roll),
-            unsolved,
-        )
-        return self._settle(state, self._model)
+        needle, clamp = straight_needle(self.scenario, roll, tip, slope)
+        unsolved = Solved.unsolved(needle, self._model.nodes.size, self.scenario.setup.axes)
+        return self._settle(State(self.scenario, self._model, clamp, float(roll), unsolved), self._model)
 
     def advance_to(self, state: State, depth: float) -> State:
-        """Return the state after an advance or withdrawal of the base that brings the tip to a depth (mm)."""
-        done, most = state, self.scenario.setup.max_advance_mm
-        travel = depth - float(state.tip[0])
+        """Return the state after an advance or withdrawal of the base that brings the tip to a depth (mm).
+
+        A bent needle is shorter along x, so the advance differs from the change of depth. CommandError for a depth
+        outside the stroke, or one that a strongly bent needle does not reach.
+        """
+        setup = self.scenario.setup
+        if not setup.start_tip_x <= depth <= setup.max_depth:
+            rule = f"must be from {setup.start_tip_x:g} to {setup.max_depth:g}, within the stroke"
+            raise CommandError("depth", depth, setup.max_depth, rule)
+        travel = off = depth - float(state.tip[0])
+        before = 0.0
         for _ in range(_PLACINGS):
-            steps = max(1, int(np.ceil(abs(travel) / most)))
+            steps = max(1, int(np.ceil(abs(travel) / setup.max_advance_mm)))
             done, _ = self.replay(state, controls(1, steps, db_x=travel / steps)[0])
-            travel += depth - float(done.tip[0])
-        return done
+            was, off = off, depth - float(done.tip[0])
+            if abs(off) < _PLACED_MM:
+                return done
+            secant = (travel - before) / (was - off) if was != off else 1.0
+            before, travel = travel, travel + min(max(secant, _SECANTS[0]), _SECANTS[1]) * off
+        raise CommandError(
+            "depth", depth, depth - off, f"not reached in {_PLACINGS} tries: the needle is bent too far"
+        )
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
@@ -282,22 +275,17 @@ class Simulator:
         """
         self._check_mechanics(state)
         axes = self.scenario.setup.axes
-        measured = np.array([_point(values, axes) for values in (tip, *points)])
-        if not np.isfinite(measured).all():
-            raise CommandError(
-                "measured position", float(measured[~np.isfinite(measured)][0]), 0.0, "must be finite"
-            )
+        measured = np.array([measured_point(values, axes) for values in (tip, *points)])
         across = measured[:, 1] if axes == 1 else measured[:, 1] + 1j * measured[:, 2]
         order = 1 + np.argsort(measured[1:, 0])
         x = measured[order, 0]
         self._check_points(state, x)
-        direction = None if slope is None else _slope(slope, axes)
-        after = self._assimilate(state, (across[0].item(), direction), x, across[order])
+        direction = np.nan if slope is None else measured_slope(slope, axes)
+        held = nd.to_parts(np.array([[across[0], direction]]), axes)
+        after = self._assimilate(state, held, x, across[order])
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
-    def _assimilate(
-        self, state: State, tip: tuple[Lateral, Lateral | None], x: Floats, y: nd.Laterals
-    ) -> State:
+    def _assimilate(self, state: State, held: Floats, x: Floats, y: nd.Laterals) -> State:
         place = self._model.nodes["x"].searchsorted(x)
         merged = self._model._replace(nodes=insert_essential(self._model.nodes, x))
         solved = state.solved
@@ -306,7 +294,7 @@ class Simulator:
             rest=np.insert(solved.rest, place, nd.to_parts(y, self.scenario.setup.axes), axis=0),
             compression=np.insert(solved.compression, place, 0.0, axis=0),
         )
-        return self._settle(replace(state, solved=more), merged, tip)
+        return self._settle(replace(state, solved=more), merged, held)
 
     def _check_points(self, state: State, x: Floats) -> None:
         guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
@@ -324,19 +312,12 @@ class Simulator:
                 )
                 raise CommandError("measured point x", float(value), high, rule)
 
-    def _settle(
-        self, state: State, merged: Model, held: tuple[Lateral, Lateral | None] | None = None
-    ) -> State:
-        """Return the state solved again, with nodes of the scenario or more, and the tip held: y (mm) and slope."""
+    def _settle(self, state: State, merged: Model, held: Floats | None = None) -> State:
+        """Return the state solved again, with nodes of the scenario or more; held: as for `run`."""
         packed = self._packed if merged is self._model else pack([merged])
-        none, axes = np.zeros(1, dtype=np.int64), self.scenario.setup.axes
-        tip = (
-            None
-            if held is None
-            else nd.to_parts(np.array([[np.nan if h is None else h for h in held]]), axes)
-        )
+        none = np.zeros(1, dtype=np.int64)
         rows, starts = np.zeros((1, 0, len(COLUMNS))), pack_states([state], merged.nodes.size)
-        out = run(packed, none, starts, none, rows, self._no_lines, 1, ends=True, held=tip)
+        out = run(packed, none, starts, none, rows, self._no_lines, 1, ends=True, held=held)
         solved = Solved.of(merged, out, 0).without_points(merged.nodes)
         return replace(state, model=self._model, solved=solved)
 
@@ -356,21 +337,3 @@ class Simulator:
 
     def __reduce__(self) -> tuple[Callable[..., "Simulator"], tuple[Scenario, int]]:
         return partial(Simulator, constants=self._model), (self.scenario, self.threads)
-
-
-def _point(values: Sequence[float], axes: int) -> list[float]:
-    """Return the coordinates of a measured point; CommandError for any other number of them."""
-    if len(values) != 1 + axes:
-        rule = f"must be {1 + axes}, {', '.join('xyz'[: 1 + axes])} in mm"
-        raise CommandError("coordinates of a measured point", len(values), 1 + axes, rule)
-    return [float(value) for value in values]
-
-
-def _slope(values: Sequence[float], axes: int) -> Lateral:
-    """Return a measured slope; CommandError for another number of coordinates, or one that is not finite."""
-    if len(values) != axes:
-        rule = f"must be {axes}: dy/dx" + (" and dz/dx" if axes > 1 else "")
-        raise CommandError("coordinates of a measured slope", len(values), axes, rule)
-    if not np.isfinite(values).all():
-        raise CommandError("measured slope", float("nan"), 0.0, "must be finite")
-    return float(values[0]) if axes == 1 else complex(*values)

@@ -36,7 +36,7 @@ class Contacts(NamedTuple):
     position: Floats  # present position y, z (k, 2), mm
     stretch: Floats  # stretch λ
     active: NDArray[np.bool_]  # whether the point is behind the tip
-    law: NDArray[np.int64]  # index of the tissue's law, as in `laws_of`
+    law: NDArray[np.int64]  # index of the law along the channel, as in `all_laws`
 
     def __repr__(self) -> str:
         least = f", least stretch {self.stretch.min():.4f}" if len(self.x) else ""

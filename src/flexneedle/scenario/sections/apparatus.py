@@ -38,8 +38,8 @@ class Setup(Section):
     guide_to_skin_mm: Positive | None = None
     """G, distance from guide to skin. Not set: no guide."""
     guide_clearance_mm: NonNegative | None = None
-    """Clearance of the needle in the guide, to either side. Not set: 0 in plans; `adaptive-mpc` estimates it from
-    the prior of its settings."""
+    """Clearance of the needle in the guide, to either side; mean of its prior in `adaptive-mpc`. Not set: 0, and
+    `control.adaptive_mpc.clearance_mm` as the mean."""
     tip_to_skin_mm: Positive
     """Distance from tip to skin at the start."""
     stroke_mm: Positive

@@ -148,7 +148,7 @@ class ControlSettings(Section):
 class PhantomSettings(Section):
     """Section `phantom`: differences of the virtual phantom from the controller's model, drawn for each insertion.
 
-    The plant `model` has no initial bend, guide clearance, friction or stiffness variation; `exact` has all.
+    The plant `model` has no initial bend, friction or stiffness variation, and the model's clearance; `exact` has all.
     """
 
     shear_modulus_factor: PositiveRange = (0.6, 1.6)

@@ -1,10 +1,10 @@
 """The laws by name, and the layers of a scenario, each by its law. A new law is a file here with a `Layer` subclass."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
 import numpy as np
 from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
@@ -24,22 +24,16 @@ def _is_law(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, Layer) and value is not Layer
 
 
-def _subclasses(of: type[Layer]) -> Iterator[type[Layer]]:
-    for law in of.__subclasses__():
-        yield law
-        yield from _subclasses(law)
-
-
 def _find_laws() -> dict[str, type[Layer]]:
-    """Return the subclasses of Layer in the files of this folder, by the names of their files."""
+    """Return the layers in the files of this folder whose `law` is the name of the file, by this name."""
     package = __name__.rpartition(".")[0]
+    laws: dict[str, type[Layer]] = {}
     for file in iter_modules([str(Path(__file__).parent)]):
         if file.name != "laws":
-            import_module(f"{package}.{file.name}")
-    laws = {law.__module__: law for law in _subclasses(Layer)}
-    return {
-        module.rpartition(".")[2]: law for module, law in laws.items() if module.startswith(f"{package}.")
-    }
+            for law in vars(import_module(f"{package}.{file.name}")).values():
+                if _is_law(law) and get_args(law.model_fields["law"].annotation) == (file.name,):
+                    laws[file.name] = law
+    return laws
 
 
 LAWS = _find_laws()
@@ -114,5 +108,5 @@ def _broken_rule(layer: Layer) -> str:
 if TYPE_CHECKING:
     AnyLayer = Layer
 else:
-    AnyLayer = Annotated[SerializeAsAny[Union[tuple(LAWS.values())]], WrapValidator(_layer)]  # noqa: UP007
+    AnyLayer = Annotated[SerializeAsAny[Union[(LAWS[DEFAULT], *LAWS.values())]], WrapValidator(_layer)]
 """A layer of any law; the schema has those that come with the package."""

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import ValidationError, model_validator
@@ -10,6 +10,7 @@ from pydantic import ValidationError, model_validator
 from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
 from flexneedle.scenario.problems import Problem, problems_of, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
+from flexneedle.types import Law
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,27 +18,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _BEVEL_MARGIN = 0.001
-
-
-class ChannelLaw(Protocol):
-    """A law of radial compression, as a `Layer` has; see `mechanics.law.Law`."""
-
-    @property
-    def limit(self) -> float:
-        """Relative compression up to which the law is valid."""
-        ...
-
-    def energy(self, e: "Floats") -> "Floats":
-        """Return the energy at relative compressions e, over k h²."""
-        ...
-
-    def force(self, e: "Floats") -> "Floats":
-        """Return the force, over k h."""
-        ...
-
-    def stiffness(self, e: "Floats") -> "Floats":
-        """Return the stiffness, over k."""
-        ...
 
 
 class _Young(Section):
@@ -110,7 +90,7 @@ class Layer(Section):
         return (self.limit - _BEVEL_MARGIN) * self.compression_length_mm
 
     @property
-    def channel(self) -> ChannelLaw:
+    def channel(self) -> Law:
         """The law along the channel; the layer itself unless its channel tears. The bevel's spring has the layer's."""
         return self
 
@@ -143,14 +123,15 @@ def laws_of(tissue: Sequence[Layer]) -> tuple[list[Layer], list[int]]:
     return list(laws.values()), [place[key] for key in keys]
 
 
-def all_laws(tissue: Sequence[Layer]) -> tuple[list[ChannelLaw], list[int], list[int]]:
+def all_laws(tissue: Sequence[Layer]) -> tuple[list[Law], list[int], list[int]]:
     """Return all laws, and for each layer the index of its law, and of the law along its channel."""
     intact, place = laws_of(tissue)
-    laws, channel = [*intact], [*place]
+    laws: list[Law] = [*intact]
+    channel = [*place]
     for k, layer in enumerate(tissue):
-        if layer.channel is not layer:
+        if (law := layer.channel) is not layer:
             channel[k] = len(laws)
-            laws.append(layer.channel)
+            laws.append(law)
     return laws, place, channel
 
 

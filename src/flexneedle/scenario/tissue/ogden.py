@@ -29,13 +29,11 @@ Alpha = Annotated[
 ]
 
 
-class Ogden(Layer):
-    """A layer whose law is the one-term Ogden law: W = V (2μ/α²) (2 λ^(−α/2) + λ^α − 3), stretch λ = 1 − e."""
+class OneTermOgden(Layer):
+    """Energy, force and stiffness of the one-term Ogden law."""
 
     limit: ClassVar[float] = 0.7
 
-    law: Literal["ogden"] = "ogden"
-    """`ogden`, `linear` (without `alpha`), `tearing` (with `yield_mm`) or `module:NAME`."""
     alpha: Annotated[Alpha, Field(examples=[8.74])]
     """α, exponent of the Ogden law."""
 
@@ -58,3 +56,10 @@ class Ogden(Layer):
         stretch, a = 1.0 - e, self.alpha
         powers = (a - 1.0) * stretch ** (a - 2.0) + (0.5 * a + 1.0) * stretch ** (-0.5 * a - 2.0)
         return (2.0 / (3.0 * a)) * powers
+
+
+class Ogden(OneTermOgden):
+    """A layer whose law is the one-term Ogden law: W = V (2μ/α²) (2 λ^(−α/2) + λ^α − 3), stretch λ = 1 − e."""
+
+    law: Literal["ogden"] = "ogden"
+    """`ogden`, `linear` (without `alpha`), `tearing` (with `yield_mm`) or `module:NAME`."""

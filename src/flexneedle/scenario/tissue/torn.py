@@ -1,4 +1,4 @@
-"""A law beyond a displacement at which tissue tears: the stiffness falls, and the force saturates (docs/theory.md, 2)."""
+"""The law of a channel that tears beyond a displacement, where its force saturates (docs/theory.md, 2)."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

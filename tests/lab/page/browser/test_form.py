@@ -248,6 +248,8 @@ def test_layers_are_added_removed_and_get_another_or_a_custom_law(form, server):
     again = linear.with_values(edit_of(page, server))
     assert again.tissue[1].alpha == 8.74
     assert again.tissue[1].model_copy(update={"alpha": before.tissue[1].alpha}) == before.tissue[1]
+    page.locator("#field-tissue-1-law").select_option("tearing")
+    assert linear.with_values(edit_of(page, server)).tissue[1].yield_mm == 0.5
     given = session(5, **{"tissue.1.law": "mine:Law", "tissue.1.yield_kpa": 3.0, "tissue.1.hardens": True})
     del given.values["tissue.1.alpha"]
     server.send(given)
