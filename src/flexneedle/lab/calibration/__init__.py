@@ -1,0 +1,1 @@
+"""Recorded insertions: import, calibration of a scenario, validation."""

@@ -1,0 +1,111 @@
+"""Recorded insertions carried out by the model: the pose of the tip at each step."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from flexneedle.lab.calibration.parameters import Needle
+from flexneedle.lab.calibration.session import Recording, Session
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import DB_X, DB_Y, DG_Y, Floats
+
+_AIR_MM = 1.0  # the model starts at least so far before the skin, and behind the first step
+_LONGEST_MM = 1.0  # advance in a step of the model
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Recordings as sequences of commands of the model.
+
+    depths: x (mm) of the tip at each step of each recording, as commanded: after `corrected` the tip is at the recorded
+    depths, although a bent needle is shorter.
+    """
+
+    recordings: tuple[Recording, ...]
+    order: tuple[int, ...]  # of each recording within its session
+    guide_order: str
+    depths: tuple[Floats, ...]
+
+    @staticmethod
+    def of(session: Session) -> "Replay":
+        """Return the recordings of a session."""
+        depths = tuple(one.depth for one in session.recordings)
+        return Replay(session.recordings, session.order, session.guide_order, depths)
+
+    @property
+    def axes(self) -> int:
+        """Lateral axes."""
+        return self.recordings[0].axes
+
+    @cached_property
+    def begins(self) -> Floats:
+        """Depth (n,) at which each insertion starts in the model, in air."""
+        return np.array([min(0.0, depth[0]) - _AIR_MM for depth in self.depths])
+
+    @cached_property
+    def _parts(self) -> int:
+        """Parts of the advance between two steps, for all intervals."""
+        longest = max((abs(np.diff(depth)).max(initial=0.0) for depth in self.depths), default=0.0)
+        first = max(depth[0] - begin for depth, begin in zip(self.depths, self.begins, strict=True))
+        return max(1, int(np.ceil(max(longest, first) / _LONGEST_MM - 1e-9)))
+
+    @cached_property
+    def commands(self) -> Floats:
+        """Commands (n, m, 9): for each step `_parts` of the advance, and a motion of guide and base before or after."""
+        steps, width = max(len(depth) for depth in self.depths), self._parts + 2
+        rows = np.zeros((len(self.recordings), steps, width, 9))
+        at = {"before": slice(0, 1), "with": slice(1, -1), "after": slice(-1, None)}[self.guide_order]
+        for row, one, depth, begin in zip(rows, self.recordings, self.depths, self.begins, strict=True):
+            size = len(depth)
+            row[:size, 1:-1, DB_X] = np.diff(depth, prepend=begin)[:, None] / self._parts
+            for column, moved in ((DG_Y, one.guide), (DB_Y, one.base)):
+                change = np.diff(moved, axis=0, prepend=moved[:1])
+                for axis in range(self.axes):
+                    row[:size, at, column + axis] = change[:, axis, None] / row[:size, at].shape[1]
+        return rows.reshape(len(rows), -1, 9)
+
+    @cached_property
+    def _ends(self) -> Floats:
+        width = self._parts + 2
+        return np.arange(width - 1, self.commands.shape[1], width)
+
+    def predict(self, needles: Sequence[Needle]) -> tuple[Floats, Floats]:
+        """Return tips (v, n, k, 5) by each of v needles at the steps of n recordings, and whether all solves converged.
+
+        Those of recordings with fewer than k steps repeat their last.
+        """
+        states, models = [], []
+        for needle in needles:
+            for begin, order in zip(self.begins.tolist(), self.order, strict=True):
+                zero = (0.0,) * self.axes
+                states.append(needle.simulator.start(needle.roll, (begin, *zero), zero))
+                models.append(needle.model(order))
+        rows = np.tile(self.commands, (len(needles), 1, 1))
+        out = needles[0].simulator.rollout(states, rows, models=models, limits=False)
+        shape = len(needles), len(self.recordings), len(self._ends)
+        good: Floats = out.converged.reshape(*shape[:2], -1).all(axis=2)
+        return out.tips[:, self._ends].reshape(*shape, 5), good
+
+    def corrected(self, tips: Floats) -> "Replay":
+        """Return the replay with the advances corrected by the depths of the tips (n, k, 5) that it has led to."""
+        depths = tuple(
+            depth + (one.depth - tip[: len(depth), 0])
+            for depth, one, tip in zip(self.depths, self.recordings, tips, strict=True)
+        )
+        return replace(self, depths=depths)
+
+
+def fitting_scenario(scenario: Scenario, session: Session) -> Scenario:
+    """Return the scenario with the axes of the recordings, and a stroke for their depths.
+
+    Raises ScenarioError if the needle is too short for them.
+    """
+    deepest = max(float(one.depth.max()) for one in session.recordings)
+    changes: dict[str, object] = {}
+    if session.axes != scenario.setup.axes:
+        changes["setup.axes"] = session.axes
+    if scenario.setup.max_depth < deepest + 1.0:
+        changes["setup.stroke_mm"] = deepest + 1.0 + scenario.setup.tip_to_skin_mm
+    return scenario.with_values(changes) if changes else scenario

@@ -1,0 +1,204 @@
+"""Recorded insertions in the needle's frame: a table of steps, `steps.parquet`, and their origin, `session.toml`."""
+
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from io import BytesIO
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tomli_w
+
+from flexneedle.arguments import require_extra
+from flexneedle.errors import InputError
+from flexneedle.files import replace_file
+from flexneedle.types import Floats
+
+STEPS_FILE, SESSION_FILE = "steps.parquet", "session.toml"
+GuideOrder = Literal["before", "with", "after"]
+"""Whether the guide moves before, with or after the advance from a step to the next."""
+_FORMAT = 1
+_ACROSS = ("y", "z")
+_NUMBERS = ("position", "slope", "guide", "base")
+_UNITS = {"position": "mm", "slope": "rad", "guide": "mm", "base": "mm"}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recorded insertion: k states of the needle at rest, in mm and rad.
+
+    Attributes:
+        session: Name of its session: one needle, rig and tissue.
+        name: Its name.
+        time: Times (k,) in s; NaN where unknown.
+        depth: x (k,) of the tip, from the skin into the tissue.
+        position: y and, in space, z (k, axes) of the tip.
+        slope: dy/dx and dz/dx (k, axes) of the sensor's axis; NaN where unknown.
+        guide: y, z (k, axes) of the guide.
+        base: y, z (k, axes) of the base.
+        roll: Angle (k,) of the needle.
+    """
+
+    session: str
+    name: str
+    time: Floats
+    depth: Floats
+    position: Floats
+    slope: Floats
+    guide: Floats
+    base: Floats
+    roll: Floats
+
+    @property
+    def axes(self) -> int:
+        """Lateral axes."""
+        return self.position.shape[1]
+
+    @property
+    def guide_moves(self) -> float:
+        """Largest distance (mm) of the guide from its first position."""
+        return float(np.linalg.norm(self.guide - self.guide[0], axis=1).max())
+
+    def __repr__(self) -> str:
+        return (
+            f"<Recording {self.session}/{self.name}, {len(self.depth)} steps to {self.depth[-1]:.1f} mm, "
+            f"guide moves {self.guide_moves:.1f} mm>"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Recorded insertions, in the order in which they were made within each session.
+
+    Attributes:
+        recordings: The insertions.
+        guide_order: When the guide moves between two steps.
+        origin: Where the recordings are from: sources, frame, and what was found on import.
+    """
+
+    recordings: tuple[Recording, ...]
+    guide_order: GuideOrder = "before"
+    origin: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def axes(self) -> int:
+        """Lateral axes."""
+        return self.recordings[0].axes
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sessions."""
+        return tuple(dict.fromkeys(one.session for one in self.recordings))
+
+    @cached_property
+    def order(self) -> tuple[int, ...]:
+        """Place of each insertion within its session, from 0."""
+        counts = dict.fromkeys(self.names, 0)
+        places = []
+        for one in self.recordings:
+            places.append(counts[one.session])
+            counts[one.session] += 1
+        return tuple(places)
+
+    @property
+    def even(self) -> "Session":
+        """The first, third, … insertion of each session."""
+        return self.select([place % 2 == 0 for place in self.order])
+
+    @property
+    def odd(self) -> "Session":
+        """The second, fourth, … insertion of each session."""
+        return self.select([place % 2 == 1 for place in self.order])
+
+    def of(self, name: str) -> "Session":
+        """Return one of the sessions."""
+        return self.select([one.session == name for one in self.recordings])
+
+    def select(self, chosen: Sequence[bool]) -> "Session":
+        """Return the insertions that are chosen."""
+        kept = tuple(one for one, keep in zip(self.recordings, chosen, strict=True) if keep)
+        return replace(self, recordings=kept)
+
+    def __repr__(self) -> str:
+        steps = sum(len(one.depth) for one in self.recordings)
+        return f"<Session {', '.join(self.names)}: {len(self.recordings)} insertions, {steps} steps>"
+
+    def save(self, folder: Path) -> None:
+        """Write the folder of a session: `steps.parquet` and `session.toml`."""
+        require_extra("study", "pyarrow")
+        from pyarrow import table
+        from pyarrow.parquet import write_table
+
+        folder.mkdir(parents=True, exist_ok=True)
+        steps = BytesIO()
+        write_table(table(to_columns(self.recordings)), steps)
+        replace_file(folder / STEPS_FILE, steps.getvalue())
+        head = {"format": _FORMAT, "axes": self.axes, "guide_order": self.guide_order, "origin": self.origin}
+        replace_file(folder / SESSION_FILE, tomli_w.dumps(head).encode())
+
+
+def load_session(folder: str | Path) -> Session:
+    """Return the session of a folder of `flexneedle import`. Raises InputError if it has none."""
+    require_extra("study", "pyarrow")
+    from pyarrow import ArrowInvalid
+    from pyarrow.parquet import read_table
+
+    folder = Path(folder)
+    try:
+        head = tomllib.loads((folder / SESSION_FILE).read_text())
+        columns = {name: column.to_numpy() for name, column in read_columns(read_table(folder / STEPS_FILE))}
+    except (OSError, tomllib.TOMLDecodeError, ArrowInvalid) as error:
+        raise InputError(f"{folder}: not a session: {error}") from None
+    if head.get("format") != _FORMAT:
+        raise InputError(f"{folder}: format must be {_FORMAT}, not {head.get('format')}")
+    try:
+        recordings = tuple(from_columns(columns, int(head["axes"])))
+        return Session(recordings, head["guide_order"], head.get("origin", {}))
+    except KeyError as error:
+        raise InputError(f"{folder}: has no column or key {error}") from None
+
+
+def read_columns(rows: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the columns of an Arrow table."""
+    return zip(rows.column_names, rows.columns, strict=True)
+
+
+def to_columns(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Return the columns of the table: session, insertion, step, time_s, x_mm, then y and z of each quantity."""
+    sizes = [len(one.depth) for one in recordings]
+    columns: dict[str, Any] = {
+        "session": np.repeat([one.session for one in recordings], sizes),
+        "insertion": np.repeat([one.name for one in recordings], sizes),
+        "step": np.concatenate([np.arange(size) for size in sizes]),
+        "time_s": np.concatenate([one.time for one in recordings]),
+        "x_mm": np.concatenate([one.depth for one in recordings]),
+        "roll_rad": np.concatenate([one.roll for one in recordings]),
+    }
+    for name in _NUMBERS:
+        values = np.concatenate([getattr(one, name) for one in recordings])
+        for k, column in enumerate(_columns(name, values.shape[1])):
+            columns[column] = values[:, k]
+    return columns
+
+
+def from_columns(columns: Mapping[str, Any], axes: int) -> Iterator[Recording]:
+    """Yield the recordings of columns as of `to_columns`. Raises KeyError for a missing column."""
+    keys = list(zip(columns["session"], columns["insertion"], strict=True))
+    for (session, name), group in groupby(range(len(keys)), key=keys.__getitem__):
+        rows = np.array([*group])
+        across = {
+            kind: np.stack([columns[column][rows] for column in _columns(kind, axes)], axis=1)
+            for kind in _NUMBERS
+        }
+        single = {"time": "time_s", "depth": "x_mm", "roll": "roll_rad"}
+        yield Recording(
+            str(session), str(name), **{key: columns[column][rows] for key, column in single.items()}, **across
+        )
+
+
+def _columns(name: str, axes: int) -> list[str]:
+    stem = "" if name == "position" else f"{name}_"
+    return [f"{stem}{axis}_{_UNITS[name]}" for axis in _ACROSS[:axes]]
