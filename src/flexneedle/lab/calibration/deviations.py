@@ -35,7 +35,16 @@ _UNITS = ("rad/√mm", "mm/√mm", "1", "mm", "1/mm", "1", "mm", "rad")
 _INTERVALS = 4  # kinds with a factor for each interval
 _FIRST = np.array([8e-4, 0.03, 0.3, 8.0, 2e-5, 0.1, 0.03, 3e-4])
 _BOUNDS = np.array(
-    [(1e-5, 0.1), (1e-4, 1.0), (1e-3, 3.0), (1e-2, 100.0), (1e-6, 1e-3), (1e-3, 2.0), (5e-3, 3.0), (5e-5, 0.1)]
+    [
+        (1e-5, 0.1),
+        (1e-4, 1.0),
+        (1e-3, 3.0),
+        (1e-2, 100.0),
+        (1e-6, 1e-3),
+        (1e-3, 2.0),
+        (5e-3, 3.0),
+        (5e-5, 0.1),
+    ]
 )
 _START = np.array([5.0, 0.1])  # standard deviation of e (mm) and ξ (rad) at the first step
 TAIL = 4.0
@@ -55,7 +64,9 @@ class Noise:
 
     def __str__(self) -> str:
         pairs = zip(KINDS, self.sd, _UNITS, strict=True)
-        return ", ".join(f"{kind} {value:.3g}{'' if unit == '1' else f' {unit}'}" for kind, value, unit in pairs)
+        return ", ".join(
+            f"{kind} {value:.3g}{'' if unit == '1' else f' {unit}'}" for kind, value, unit in pairs
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +95,12 @@ class Deviations:
     def predicted(self) -> Floats:
         """Lateral motion and turn (2, k) in each interval beyond a straight continuation, as the model predicts."""
         straight = np.append(0.0, self.slope[:-1] * self.advance[1:])
-        return np.stack([np.diff(self.position, prepend=self.position[0]) - straight,
-                         np.diff(self.slope, prepend=self.slope[0])])
+        return np.stack(
+            [
+                np.diff(self.position, prepend=self.position[0]) - straight,
+                np.diff(self.slope, prepend=self.slope[0]),
+            ]
+        )
 
     def unit_covariances(self, factors: Floats) -> Floats:
         """Return covariances (8, 2 k, 2 k) of e and ξ by `KINDS`, for standard deviations of 1; the last two are noise.
@@ -157,17 +172,26 @@ class Whitened:
         u, v = deviations.predicted
         dx, sd = deviations.advance[1:], noise.sd
         unit = np.zeros((size - 1, 2, 2))
-        unit[:, 0, 0] = sd[0] ** 2 * dx**3 / 3.0 + sd[1] ** 2 * dx + (sd[2] * u[1:]) ** 2 + (sd[3] * v[1:]) ** 2
+        unit[:, 0, 0] = (
+            sd[0] ** 2 * dx**3 / 3.0 + sd[1] ** 2 * dx + (sd[2] * u[1:]) ** 2 + (sd[3] * v[1:]) ** 2
+        )
         unit[:, 1, 1] = sd[0] ** 2 * dx + (sd[2] * v[1:]) ** 2
         unit[:, 0, 1] = unit[:, 1, 0] = sd[0] ** 2 * dx**2 / 2.0 + sd[2] ** 2 * u[1:] * v[1:]
         solved = cho_factor(self.covariance(noise), lower=True)
         weighed = cho_solve(solved, residuals)
         effect = deviations.effect[self.known].reshape(-1, 2, size)[:, :, 1:]
         prior = unit * self.factors[1:, None, None]
-        carried = np.einsum("kij,pjk->kip", prior, effect)  # covariance of each disturbance with the residuals
+        carried = np.einsum(
+            "kij,pjk->kip", prior, effect
+        )  # covariance of each disturbance with the residuals
         mean = carried @ weighed
-        left = prior - np.einsum("kip,pkj->kij", carried, cho_solve(solved, carried.transpose(2, 0, 1).reshape(
-            len(residuals), -1)).reshape(len(residuals), size - 1, 2))
+        left = prior - np.einsum(
+            "kip,pkj->kij",
+            carried,
+            cho_solve(solved, carried.transpose(2, 0, 1).reshape(len(residuals), -1)).reshape(
+                len(residuals), size - 1, 2
+            ),
+        )
         squared = np.linalg.solve(unit, left + mean[:, :, None] * mean[:, None, :])
         distance = np.trace(squared, axis1=1, axis2=2)
         return Whitened(deviations, self.known, np.append(1.0, (TAIL + distance) / (TAIL + 2.0)))

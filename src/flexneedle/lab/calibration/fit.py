@@ -106,7 +106,9 @@ def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -
             columns = [1 + axis, 3 + axis]
             found = np.append(one.position[:, axis], one.slope[:, axis])
             known = np.isfinite(found)
-            model = tips[0, n, :count, columns].ravel() + np.append(np.zeros(count), np.full(count, offset[axis]))
+            model = tips[0, n, :count, columns].ravel() + np.append(
+                np.zeros(count), np.full(count, offset[axis])
+            )
             derivative = np.zeros((2 * count, len(point)))
             for k, each in enumerate(change):
                 derivative[:, k] = each[n, :count, columns].ravel()

@@ -30,7 +30,8 @@ def forecast(fitted: Fitted) -> list[Forecast]:
     for n, one in enumerate(problem.replay.recordings):
         count = len(one.depth)
         both = [
-            _on_axis(paths[axes * n + axis], fitted.noise, found.values[axes * n + axis]) for axis in range(axes)
+            _on_axis(paths[axes * n + axis], fitted.noise, found.values[axes * n + axis])
+            for axis in range(axes)
         ]
         model = found.tips[n, :count, 1 : 1 + axes]
         mean = np.stack([expected for expected, _ in both], axis=2) + model
@@ -60,7 +61,9 @@ def _on_axis(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, F
     return expected, sd
 
 
-def _factors(path: Whitened, noise: Noise, residuals: Floats, known: Floats, i: int, factors: Floats) -> Floats:
+def _factors(
+    path: Whitened, noise: Noise, residuals: Floats, known: Floats, i: int, factors: Floats
+) -> Floats:
     """Return the factors of the intervals up to step i, from the residuals up to there."""
     if i == 0:
         return factors

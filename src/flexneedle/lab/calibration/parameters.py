@@ -95,7 +95,9 @@ def _guide(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
     if scenario.setup.guide_to_skin_mm is None:
         raise InputError("fit = guide: the scenario has no guide (setup.guide_to_skin_mm)")
     first = math.log(scenario.setup.guide_to_skin_mm)
-    yield Parameter("guide", "guide to skin", first, 0.1, first - 1.0, first + 1.0, 0.02, math.log(1.25), True, "mm")
+    yield Parameter(
+        "guide", "guide to skin", first, 0.1, first - 1.0, first + 1.0, 0.02, math.log(1.25), True, "mm"
+    )
 
 
 def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
@@ -108,7 +110,9 @@ def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
 def _yield(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
     first = math.log(_yield_of(scenario) or _FIRST_YIELD_MM)
     low, high = math.log(0.02), math.log(min(layer.compression_length_mm for layer in scenario.tissue) * 0.69)
-    yield Parameter("yield", "displacement that tears", min(first, high), 0.7, low, high, 0.05, math.log(2.0), True, "mm")
+    yield Parameter(
+        "yield", "displacement that tears", min(first, high), 0.7, low, high, 0.05, math.log(2.0), True, "mm"
+    )
 
 
 def _drift(_scenario: Scenario, _reached: float) -> Iterator[Parameter]:
@@ -169,7 +173,10 @@ def _with_yield(scenario: Scenario, yield_mm: float | None) -> Scenario:
     if yield_mm is None:
         return scenario
     layers = [layer.model_dump(mode="json", exclude_none=True) for layer in scenario.tissue]
-    torn = [each | {"law": "tearing", "yield_mm": yield_mm} if each["law"] in ("ogden", "tearing") else each for each in layers]
+    torn = [
+        each | {"law": "tearing", "yield_mm": yield_mm} if each["law"] in ("ogden", "tearing") else each
+        for each in layers
+    ]
     return scenario.with_values({"tissue": torn})
 
 

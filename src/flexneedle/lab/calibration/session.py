@@ -195,7 +195,10 @@ def from_columns(columns: Mapping[str, Any], axes: int) -> Iterator[Recording]:
         }
         single = {"time": "time_s", "depth": "x_mm", "roll": "roll_rad"}
         yield Recording(
-            str(session), str(name), **{key: columns[column][rows] for key, column in single.items()}, **across
+            str(session),
+            str(name),
+            **{key: columns[column][rows] for key, column in single.items()},
+            **across,
         )
 
 

@@ -1,0 +1,1 @@
+"""Import of recorded insertions: tables, a map of their columns, steps, frames."""
