@@ -1,0 +1,204 @@
+"""Calibration: a scenario fitted to recorded insertions, with intervals, and what the data do not say."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.lab.calibration.fit import Fitted, Problem, fit
+from flexneedle.lab.calibration.intervals import Interval, intervals, profile
+from flexneedle.lab.calibration.parameters import Parameter, Trial, parameters_of, trial_of, with_trial
+from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
+from flexneedle.lab.calibration.session import Session
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Floats
+
+DEFAULT_FIT = ("stiffness", "bevel", "guide")
+_OTHER_STARTS = {"stiffness": (np.log(10.0), -np.log(10.0)), "yield": (np.log(0.3),)}
+"""Further starts of a fit, as changes of a coordinate."""
+_SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
+_MOVED = 1e-3  # of the prior's standard deviation
+_ADVICE = {
+    "stiffness": "move the guide by ±{guide:g} mm at depths of {depths} mm",
+    "bevel": "insert with the guide at rest, to {reached:.0f} mm or deeper",
+    "guide": "move the guide by ±{guide:g} mm at depths of {depths} mm",
+    "clearance": "move the guide to and fro by {guide:g} mm with the tip near the skin",
+    "yield": "move the guide by ±{guide:g} and ±{more:g} mm at depths of {depths} mm",
+    "drift": "repeat the first insertion at the end of the session",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A scenario fitted to a session.
+
+    Attributes:
+        start: The scenario before the fit.
+        fitted: The fit of the least cost.
+        others: The fits from other starts.
+    """
+
+    start: Scenario
+    session: Session
+    fitted: Fitted
+    others: tuple[Fitted, ...] = ()
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The fitted parameters."""
+        return self.fitted.problem.parameters
+
+    @cached_property
+    def intervals(self) -> dict[str, Interval]:
+        """Intervals of 95 % by label, in the coordinates of the fit."""
+        labels = (each.label for each in self.parameters)
+        return dict(zip(labels, intervals(self.fitted), strict=True))
+
+    @cached_property
+    def unidentified(self) -> dict[str, str]:
+        """Parameters that the data do not identify, by label, each with the experiment that would."""
+        deepest = max(float(one.depth.max()) for one in self.session.recordings)
+        values = {
+            "guide": 3.0, "more": 6.0, "reached": deepest,
+            "depths": ", ".join(f"{share * deepest:.0f}" for share in (0.15, 0.3, 0.5)),
+        }  # fmt: skip
+        return {
+            each.label: _ADVICE[each.name].format(**values)
+            for each in self.parameters
+            if not self.intervals[each.label].identified
+        }
+
+    @cached_property
+    def trial(self) -> Trial:
+        """Values of all parameters: the scenario's for those that are not identified."""
+        point = self.fitted.point[: len(self.parameters)].copy()
+        for k, each in enumerate(self.parameters):
+            if each.label in self.unidentified:
+                point[k] = each.start
+        return trial_of(self.start, self.parameters, point)
+
+    @property
+    def direction(self) -> float:
+        """Angle (rad) of the bevel from y towards z in the recordings, at the roll 0."""
+        return float(np.angle(complex(*self.trial.bevel)))
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The calibrated scenario, with priors of `adaptive-mpc` from the intervals."""
+        return with_trial(self.start, self.trial).with_values(dict(self._priors()))
+
+    def _priors(self) -> Iterator[tuple[str, float]]:
+        """Yield the priors of the controller: interval, and variation from insertion to insertion."""
+        gain = float(self.fitted.noise.sd[5])
+        found = {each.name: each for each in self.parameters if each.label not in self.unidentified}
+        if "stiffness" in found:
+            sd = self._sd(found["stiffness"])
+            yield "control.adaptive_mpc.modulus_log_sd", round(float(np.hypot(sd, gain)), 3)
+        if "bevel" in found:
+            size = float(np.linalg.norm(self.trial.bevel))
+            sd = self._sd(found["bevel"]) / max(size, 1e-3)
+            yield "control.adaptive_mpc.bevel_sd", round(float(np.clip(np.hypot(sd, gain), 0.05, 1.0)), 3)
+        if "clearance" in found:
+            yield "control.adaptive_mpc.clearance_sd_mm", round(self._sd(found["clearance"]), 4)
+
+    def _sd(self, parameter: Parameter) -> float:
+        """Return the standard deviation of a parameter in its coordinate."""
+        interval = self.intervals[parameter.label]
+        return 0.5 * (interval.high - interval.low) / 1.96
+
+    @cached_property
+    def problems(self) -> tuple[str, ...]:
+        """Reasons not to trust the fit: not settled, at a bound, not moved, two minima, solves that did not converge."""
+        return tuple(self._find_problems())
+
+    def _find_problems(self) -> Iterator[str]:
+        point, sd = self.fitted.point, self.fitted.problem.sd
+        if not self.fitted.settled:
+            yield "the fit did not settle"
+        if not self.fitted.converged:
+            yield "some steps of the model did not converge"
+        for each, interval in zip(self.parameters, self.intervals.values(), strict=True):
+            if interval.bound:
+                yield f"{each.label} is at its {interval.bound} bound, {each.value(interval.value):.4g} {each.unit}".rstrip()
+        size = len(self.parameters)
+        if size and (np.abs(point - self.fitted.problem.start)[:size] < _MOVED * sd[:size]).all():
+            yield "the fit did not move from its start"
+        for other in self.others:
+            scale = np.sqrt(np.diag(np.linalg.inv(self.fitted.information)))[:size]
+            apart = np.abs(other.point - point)[:size] / scale
+            if other.settled and other.cost - self.fitted.cost < _SAME_COST and apart.max() > _OTHER_POINT:
+                label = self.parameters[int(apart.argmax())].label
+                here, there = (
+                    self.parameters[int(apart.argmax())].value(p[int(apart.argmax())])
+                    for p in (point, other.point)
+                )
+                yield f"two minima fit alike: {label} = {here:.4g} or {there:.4g}"
+                break
+
+    def profile(self, label: str, count: int = 9) -> tuple[Floats, Floats]:
+        """Return values (count,) of a parameter, and the rise of −2 ln of the likelihood with it at each."""
+        labels = [each.label for each in self.parameters]
+        if label not in labels:
+            raise InputError(f"parameter = {label}: must be one of {', '.join(labels)}")
+        k = labels.index(label)
+        interval, parameter = self.intervals[label], self.parameters[k]
+        width = 1.5 * (interval.high - interval.value)
+        at = np.clip(interval.value + width * np.linspace(-1.0, 1.0, count), parameter.low, parameter.high)
+        return np.array([parameter.value(each) for each in at.tolist()]), profile(self.fitted, k, at.tolist())
+
+    def table(self) -> list[tuple[str, str, str]]:
+        """Return rows of a table: parameter, value, interval of 95 %."""
+        rows = []
+        for each in self.parameters:
+            interval = self.intervals[each.label]
+            if not interval.identified:
+                rows.append((each.label, "not identified", self.unidentified[each.label]))
+                continue
+            value, low, high = (each.value(x) for x in (interval.value, interval.low, interval.high))
+            rows.append((each.label, f"{value:.4g} {each.unit}".rstrip(), f"{low:.4g} to {high:.4g}"))
+        return rows
+
+
+def calibrate(
+    scenario: Scenario | str | Path, session: Session, fit_names: Sequence[str] = DEFAULT_FIT
+) -> Calibration:
+    """Fit a scenario to a session.
+
+    Args:
+        scenario: Start of the fit, and priors; as for `load_scenario`.
+        session: Recorded insertions, from `load_session`.
+        fit_names: Parameters: stiffness, bevel, guide, clearance, yield, drift.
+
+    Raises:
+        InputError: The session is empty, or a parameter cannot be fitted in this scenario.
+        ScenarioError: The scenario cannot be used for these recordings.
+    """
+    if not session.recordings:
+        raise InputError("session: has no recordings")
+    loaded = load_scenario(scenario)
+    prepared = fitting_scenario(loaded, session)
+    reached = max(float(one.depth.max()) for one in session.recordings)
+    problem = Problem(prepared, parameters_of(prepared, fit_names, reached), Replay.of(session))
+    fits = [fit(problem, start) for start in _starts(problem)]
+    best, *others = sorted(fits, key=lambda each: each.cost)
+    return Calibration(loaded, session, best, tuple(others))
+
+
+def _starts(problem: Problem) -> Iterator[Floats]:
+    """Yield the starts of the fit: the scenario, and others for parameters with several minima."""
+    yield problem.start
+    for name, changes in _OTHER_STARTS.items():
+        places = [k for k, each in enumerate(problem.parameters) if each.name == name]
+        for change in changes if places else ():
+            start = problem.start.copy()
+            start[places] += change
+            yield np.clip(start, *problem.bounds)
+
+
+def split(session: Session) -> tuple[Session, Session]:
+    """Return the halves of a session for training and test: every other insertion of each session."""
+    return session.even, replace(session, recordings=session.odd.recordings)

@@ -1,0 +1,93 @@
+"""`flexneedle import`, `calibrate` and `validate`: from recorded insertions to a scenario, and how well it predicts."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from flexneedle.arguments import expand_home
+from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import print_json, print_table
+from flexneedle.cli.progress import print_note
+
+
+def add_import(commands: Commands) -> None:
+    """Add `import` to the parser of `flexneedle`."""
+    parser = add_command(
+        commands,
+        "import",
+        "read recorded insertions into a session",
+        _import,
+        "flexneedle import recordings/*.csv --map lab.toml --out session",
+        about="Read recorded insertions: CSV, TSV, Parquet, MATLAB, MCAP and rosbag2 files.",
+    )
+    parser.add_argument("files", metavar="FILE", nargs="+", type=expand_home, help="recordings")
+    parser.add_argument(
+        "--map",
+        metavar="MAP",
+        type=expand_home,
+        required=True,
+        help="TOML file that names columns, units and axes",
+    )
+    parser.add_argument("--out", metavar="DIR", type=expand_home, required=True, help="folder of the session")
+
+
+def _import(args: argparse.Namespace) -> int:
+    from flexneedle.lab.calibration.importing.importer import import_recordings
+    from flexneedle.lab.calibration.importing.map_file import load_map
+
+    imported = import_recordings(args.files, load_map(args.map))
+    imported.session.save(args.out)
+    for line in imported.understood:
+        print(line)
+    for line in imported.suspected:
+        print_note(line)
+    print(f"\nSession: {args.out}")
+    return 0
+
+
+def add_calibrate(commands: Commands) -> None:
+    """Add `calibrate` to the parser of `flexneedle`."""
+    parser = add_command(
+        commands,
+        "calibrate",
+        "fit a scenario to recorded insertions",
+        _calibrate,
+        "flexneedle calibrate session mine.toml --fit stiffness bevel guide --out calibrated.toml",
+        about="Fit a scenario to the insertions of a session. Exit status 1: the fit is not to be trusted, and why.",
+    )
+    parser.add_argument("session", metavar="SESSION", type=expand_home, help="folder of the session")
+    parser.add_argument("scenario", metavar="SCENARIO", help="scenario from which the fit starts")
+    parser.add_argument(
+        "--fit",
+        nargs="+",
+        metavar="NAME",
+        default=["stiffness", "bevel", "guide"],
+        help="parameters: stiffness, bevel, guide, clearance, yield, drift (default: the first three)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=expand_home,
+        default=Path("calibrated.toml"),
+        help="calibrated scenario (default: calibrated.toml)",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    from flexneedle.lab.calibration.calibration import calibrate
+    from flexneedle.lab.calibration.files import read_record, write_calibration
+    from flexneedle.lab.calibration.session import load_session
+
+    found = calibrate(args.scenario, load_session(args.session), args.fit)
+    write_calibration(found, args.out, str(args.scenario))
+    if args.json:
+        print_json(read_record(args.out) or {})
+    else:
+        print_table("", ("parameter", "value", "95 %"), found.table())
+        print(f"Errors: {found.fitted.noise}")
+        print(f"\nScenario: {args.out}")
+    for problem in found.problems:
+        print_note(problem)
+    return 1 if found.problems else 0
