@@ -47,14 +47,18 @@ def load_environment(source: str | Path) -> Environment:
 
 def load_registration(path: Path, scenario: Scenario) -> Scenario:
     """Return the scenario with the registration of a file of `em register`. Raises ScenarioError if it has none."""
+    return scenario.with_values({"tracker.registration": read_registration(path).model_dump(mode="json")})
+
+
+def read_registration(path: Path) -> Registration:
+    """Return the registration of a file of `em register`. Raises ScenarioError if it has none."""
     table = _REGISTRATIONS.read(path).get("tracker", {})
     if not isinstance(table, dict) or not isinstance(table.get("registration"), dict):
         raise ScenarioError(f"{label(path)}: has no table [tracker.registration]; em register writes one")
     try:
-        Registration.model_validate(table["registration"])
+        return Registration.model_validate(table["registration"])
     except ValidationError as error:
         raise ScenarioError(*(f"{label(path)}: {line}" for line in describe(error, Registration))) from None
-    return scenario.with_values({"tracker.registration": table["registration"]})
 
 
 def dump_scenario(scenario: Scenario) -> str:

@@ -55,7 +55,7 @@ class Recording:
     @property
     def axes(self) -> int:
         """Lateral axes."""
-        return self.position.shape[1]
+        return int(self.position.shape[1])
 
     @property
     def guide_moves(self) -> float:

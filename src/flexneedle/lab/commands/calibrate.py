@@ -1,4 +1,4 @@
-"""`flexneedle import`, `calibrate` and `validate`: from recorded insertions to a scenario, and how well it predicts."""
+"""`flexneedle calibrate` and `validate`: from recorded insertions to a scenario, and how well it predicts."""
 
 from __future__ import annotations
 
@@ -9,41 +9,6 @@ from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json, print_table
 from flexneedle.cli.progress import print_note
-
-
-def add_import(commands: Commands) -> None:
-    """Add `import` to the parser of `flexneedle`."""
-    parser = add_command(
-        commands,
-        "import",
-        "read recorded insertions into a session",
-        _import,
-        "flexneedle import recordings/*.csv --map lab.toml --out session",
-        about="Read recorded insertions: CSV, TSV, Parquet, MATLAB, MCAP and rosbag2 files.",
-    )
-    parser.add_argument("files", metavar="FILE", nargs="+", type=expand_home, help="recordings")
-    parser.add_argument(
-        "--map",
-        metavar="MAP",
-        type=expand_home,
-        required=True,
-        help="TOML file that names columns, units and axes",
-    )
-    parser.add_argument("--out", metavar="DIR", type=expand_home, required=True, help="folder of the session")
-
-
-def _import(args: argparse.Namespace) -> int:
-    from flexneedle.lab.calibration.importing.importer import import_recordings
-    from flexneedle.lab.calibration.importing.map_file import load_map
-
-    imported = import_recordings(args.files, load_map(args.map))
-    imported.session.save(args.out)
-    for line in imported.understood:
-        print(line)
-    for line in imported.suspected:
-        print_note(line)
-    print(f"\nSession: {args.out}")
-    return 0
 
 
 def add_calibrate(commands: Commands) -> None:

@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Container, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,7 @@ _SEPARATORS = ",;\t|"
 _SEPARATOR_LINE = re.compile(r'"?sep=([,;\t|])"?', re.IGNORECASE)  # written by Excel
 COMMENT = ("#", "%", "//")
 """Starts of lines that are comments."""
+_MARKS = "".join(COMMENT) + " "
 _OTHER_KINDS = {
     b"\x1f\x8b": "is compressed with gzip: unpack it",
     b"PK\x03\x04": "is an Excel or ZIP file: save it as CSV",
@@ -43,6 +44,22 @@ def open_text(path: Path) -> TextIO:
     with path.open("rb") as file:
         wide = file.read(2) in _UTF_16
     return path.open(encoding="utf-16" if wide else "utf-8-sig", errors="replace")
+
+
+def find_layout(path: Path, names: Collection[str]) -> CsvLayout:
+    """Return the layout of a CSV file whose header is the first line with these names, also a comment.
+
+    If no line has them, the layout of `read_layout`. Raises InputError if there are no column names or no row.
+    """
+    found = read_layout(path)
+    with open_text(path) as file:
+        for number, line in enumerate(islice(file, _FIRST_LINES)):
+            for text in dict.fromkeys((line.strip(" \n").lstrip(_MARKS), line.strip(" \n"))):
+                separator = _find_separator(text)
+                header = tuple(name.strip() for name in _split_loosely(text, separator))
+                if names and {*names} <= {*header}:
+                    return CsvLayout(header, separator, number)
+    return found
 
 
 def read_layout(path: Path) -> CsvLayout:

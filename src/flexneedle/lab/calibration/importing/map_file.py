@@ -1,22 +1,27 @@
 """The map of a laboratory's recordings: what each column is, in which unit and which axes (a TOML file)."""
 
 import re
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from flexneedle.lab.calibration.session import GuideOrder
+from flexneedle.scenario.files import read_registration
 from flexneedle.scenario.library import Library
 from flexneedle.scenario.problems import Problem, refuse
-from flexneedle.scenario.sections.fields import Positive, Section
+from flexneedle.scenario.sections.fields import Positive, Section, count
 from flexneedle.scenario.sections.registration import Registration
 
 LENGTHS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "inch": 25.4}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_AXIS = re.compile(r"[+-]?[xyz]")
+FIT = "fit"
+"""An axis of the frame that is estimated."""
 MAPS = Library("a map of recordings")
+_AXIS = re.compile(r"[+-]?[xyz]")
 
 
 def _direction(text: str) -> str:
@@ -25,108 +30,180 @@ def _direction(text: str) -> str:
     return text
 
 
+def _fitted(text: str) -> str:
+    if text != FIT and not _AXIS.fullmatch(text):
+        raise ValueError('must be an axis with its sign, "x", "-y" …, or "fit"')
+    return text
+
+
 Column = Annotated[str, Field(min_length=1, max_length=200)]
-"""A column by its header, with a minus sign before it to invert its sign."""
+"""A column by its name, with a minus sign before it to invert its sign."""
 Columns = Annotated[tuple[Column, ...], Field(strict=False)]
+Times = Annotated[tuple[Column, ...], Field(strict=False, max_length=2)]
+Position = Annotated[tuple[Column, ...], Field(strict=False, min_length=2, max_length=3)]
+Angles = Annotated[tuple[Column, ...], Field(strict=False, min_length=1, max_length=2)]
 Three = Annotated[tuple[Column, Column, Column], Field(strict=False)]
+Four = Annotated[tuple[Column, Column, Column, Column], Field(strict=False)]
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 Direction = Annotated[str, AfterValidator(_direction)]
+FrameAxis = Annotated[str, AfterValidator(_fitted)]
+LengthUnit = Literal["mm", "cm", "m", "um", "inch"]
+AngleUnit = Literal["rad", "deg", "mrad"]
+TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
 class TableMap(Section):
-    """Section `table`: how the tables are divided into insertions."""
+    """Section `table`: rows and columns of the files, and their division into insertions."""
 
     insertion: Columns = ()
-    """Columns that name an insertion. Not set: each file is one."""
+    """Columns whose values name an insertion. Not set: each file is one, with the name of the file."""
     session: Columns = ()
-    """Columns that name a session. Not set: all files are one, with the name of their folder."""
-    topics: Columns = ()
-    """Pose topics of a bag, the first with the times of the rows; columns are then TOPIC.x, TOPIC.qx and so on."""
+    """Columns whose values name a session: one needle, rig and tissue. Not set: the folder of the file."""
+    columns: Columns = ()
+    """Names of all columns of a text file without a line of names."""
+    lines_after_header: int = count(0, least=0, most=1000)
+    """Lines between the names of the columns and the first row, such as a line of units."""
+    where: dict[str, str] = Field(default={}, examples=[{"sensor": "tip"}])
+    """Values by column: other rows are ignored, such as rows of other sensors."""
+    missing: Numbers = ()
+    """Numbers that are written for a missing one, such as -999."""
 
 
 class TimeMap(Section):
-    """Section `time`."""
+    """Section `time`: optional for keyed steps. Bags have the time at which a message was recorded."""
 
-    columns: Columns = ()
-    """One column, or two: seconds and nanoseconds."""
-    unit: Literal["s", "ms", "us", "ns"] = "s"
-    """Unit of a single column."""
+    columns: Times = ()
+    """A column of numbers, dates (ISO 8601) or times of day; or two, which are added: seconds and nanoseconds, or date
+    and time of day."""
+    unit: TimeUnit = "s"
+    """Unit of the first column."""
+    second_unit: TimeUnit = "ns"
+    """Unit of the second column."""
 
 
 class TipMap(Section):
-    """Section `tip`: the measured tip."""
+    """Section `tip`: the measured tip, and the direction of the needle there in one of three forms."""
 
-    position: Three
-    """Columns of the position on the axes x, y, z of the tracker."""
-    unit: Literal["mm", "cm", "m", "um", "inch"] = "mm"
+    position: Position
+    """Columns of the position on the axes x, y, z of the tracker; two columns, x and y, for data in a plane."""
+    unit: LengthUnit = "mm"
     """Unit of the position."""
-    axis: Three | None = None
-    """Columns of the needle's axis, a vector on the axes of the tracker."""
-    quaternion: Annotated[tuple[Column, Column, Column, Column], Field(strict=False)] | None = None
-    """Columns of the sensor's orientation, instead of `axis`."""
+    axis: Position | None = None
+    """Columns of the needle's axis, a unit vector on the axes of the tracker, towards the tip."""
+    quaternion: Four | None = None
+    """Columns of the sensor's orientation, a unit quaternion from the sensor's axes to the tracker's."""
     order: Literal["wxyz", "xyzw"] = "xyzw"
     """Order of the quaternion."""
     sensor_axis: Direction = "z"
-    """Axis of the sensor that is along the needle, towards the tip."""
+    """Axis of the sensor along the needle, towards the tip."""
+    angle: Angles | None = None
+    """Columns of the angle of the needle from x of its frame towards y, in space also towards z."""
+    angle_unit: AngleUnit = "rad"
+    """Unit of the angles."""
+    status: str | None = None
+    """Column of the sensor's status; rows with another status than `ok` have no position."""
+    ok: Columns = ("ok",)
+    """Values of the status of a measured position, in capital or small letters."""
+
+    @model_validator(mode="after")
+    def _check_directions(self) -> Self:
+        given = [name for name in ("axis", "quaternion", "angle") if getattr(self, name) is not None]
+        problems = [
+            Problem(each, getattr(self, each), f"not beside {given[0]}: keep one") for each in given[1:]
+        ]
+        three = [name for name in given if len(getattr(self, name)) > 2 and name != "angle"]
+        if three and len(self.position) == 2:
+            problems.append(Problem("position", self.position, f"must have three columns beside {three[0]}"))
+        refuse(problems)
+        return self
 
 
 class StageMap(Section):
-    """Section `guide` or `base`: a stage that moves the needle laterally."""
+    """Section `guide` or `base`: the stage that moves the guide, or the base of the needle, laterally."""
 
-    y: Column
+    y: Column | None = None
     """Column of the position along y of the needle's frame."""
     z: Column | None = None
     """Column of the position along z."""
-    unit: Literal["mm", "cm", "m", "um", "inch"] = "mm"
+    position: Three | None = None
+    """Instead of y and z: columns of the position on the axes x, y, z of the tracker."""
+    unit: LengthUnit = "mm"
     """Unit of the position."""
+
+    @model_validator(mode="after")
+    def _check_columns(self) -> Self:
+        if (self.position is None) == (self.y is None and self.z is None):
+            refuse([Problem("", None, "must have y, z or both; or position alone")])
+        return self
 
 
 class RollMap(Section):
-    """Section `roll`: the angle of the needle about its axis."""
+    """Section `roll`: the rotation of the needle about its axis. Not set: the needle is not rotated."""
 
     column: Column
-    """Column of the angle."""
-    unit: Literal["rad", "deg", "mrad"] = "rad"
+    """Column of the angle from y towards z."""
+    unit: AngleUnit = "rad"
     """Unit of the angle."""
 
 
 class FrameMap(Section):
     """Section `frame`: the needle's frame in the axes of the tracker, which the needle enters along x."""
 
-    x: Direction
-    """Axis of the tracker along the insertion."""
-    y: Direction
-    """Axis of the tracker along y; z follows, right-handed."""
+    x: FrameAxis = "x"
+    """Axis of the tracker along the insertion. "fit": the mean direction at the start of a session's insertions."""
+    y: FrameAxis = "y"
+    """Axis of the tracker along y, or closest to y if x is fitted; z follows, right-handed. "fit": from the turns of
+    the tip after motions of the guide."""
+    plane: bool = False
+    """Leave z out, so that the session has one lateral axis. Positions of two columns are in a plane in any case."""
     skin_mm: float | None = None
-    """Position of the skin along x. Not set: of the first step of each insertion, less `first_depth_mm`."""
+    """Position of the skin along x. Not set: `first_depth_mm` before the first step of each insertion."""
     first_depth_mm: float = 0.0
-    """Depth of the first step."""
+    """Depth of the first step; negative: the needle starts in air."""
     registration: Registration | None = None
     """Rigid map from the tracker's frame to the one whose axes `x` and `y` name. Not set: identity."""
+    registration_file: str | None = None
+    """Instead of `registration`: the file of `flexneedle em register`, relative to the map."""
 
     @model_validator(mode="after")
     def _check_axes(self) -> Self:
-        if self.x[-1] == self.y[-1]:
-            refuse([Problem("y", self.y, f"must be another axis than x ({self.x})")])
+        problems = []
+        if self.x != FIT and self.x[-1] == self.y[-1]:
+            problems.append(Problem("y", self.y, f"must be another axis than x ({self.x})"))
+        if self.skin_mm is not None and self.first_depth_mm != 0.0:
+            problems.append(Problem("first_depth_mm", self.first_depth_mm, "not beside skin_mm: keep one"))
+        if self.x == FIT and self.skin_mm is not None:
+            problems.append(Problem("skin_mm", self.skin_mm, 'not with x = "fit": set first_depth_mm'))
+        if self.registration is not None and self.registration_file is not None:
+            problems.append(
+                Problem("registration_file", self.registration_file, "not beside registration: keep one")
+            )
+        refuse(problems)
         return self
-
-    @property
-    def rotation(self) -> Any:
-        """Rotation (3, 3) from the tracker's axes to the needle's."""
-        first, second = _unit(self.x), _unit(self.y)
-        return np.stack([first, second, np.cross(first, second)])
 
 
 class StepMap(Section):
-    """Section `steps`: how steps are found."""
+    """Section `steps`: the states of the needle at rest."""
 
     rows: Literal["steps", "stream"] = "steps"
-    """"steps": each row is a step with the needle at rest. "stream": steps are the still phases of a stream of rows."""
-    least_still_s: Positive = 0.5
-    """Shortest time for which the needle rests in a step, in a stream."""
+    """"steps": each row is a step, with the needle at rest. "stream": rows are a continuous recording, and its still
+    phases are steps."""
+    least_still_s: Positive = 1.0
+    """Shortest rest of a step in a stream."""
+    every_mm: Positive | None = None
+    """A step in a stream each time that the tip has advanced by this distance, for insertions without rests."""
     guide: GuideOrder = "before"
-    """Whether the guide moves before, with or after the advance to the next step."""
+    """Motion of the guide before, with or after the advance to the next step."""
     gap_mm: Positive = 100.0
-    """Distance between rows beyond which the recording contradicts itself."""
+    """Distance between two rows beyond which a recording is refused."""
+    retreat_mm: Positive = 2.0
+    """Retreat of the tip at which a recording ends: a withdrawal."""
+
+    @model_validator(mode="after")
+    def _check_stream(self) -> Self:
+        if self.every_mm is not None and self.rows == "steps":
+            refuse([Problem("every_mm", self.every_mm, 'needs rows = "stream"')])
+        return self
 
 
 class RecordingMap(Section):
@@ -138,25 +215,69 @@ class RecordingMap(Section):
     guide: StageMap | None = None
     base: StageMap | None = None
     roll: RollMap | None = None
-    frame: FrameMap
+    frame: FrameMap = FrameMap()
     steps: StepMap = StepMap()
 
-    def columns(self) -> set[str]:
-        """Return the names of all columns of numbers, without their signs."""
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        named = [(key, to_name(column)) for key, column in self._columns()]
+        first = {name: key for key, name in reversed(named)}
+        problems = [
+            Problem(key, name, f"is the column of {first[name]}, too")
+            for key, name in named
+            if first[name] != key
+        ]
+        if len(self.tip.position) == 2 and (self.frame.registration or self.frame.registration_file):
+            rule = "must have three columns beside frame.registration"
+            problems.append(Problem("tip.position", self.tip.position, rule))
+        if len(self.tip.position) == 2 and "z" in (self.frame.x + self.frame.y):
+            problems.append(
+                Problem("frame", None, "x and y must be the axes x and y, as tip.position has two columns")
+            )
+        refuse(problems)
+        return self
+
+    @property
+    def axes(self) -> int:
+        """Lateral axes of the session."""
+        return 1 if self.frame.plane or len(self.tip.position) == 2 else 2
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """Names of the columns of text."""
+        status = [self.tip.status] if self.tip.status else []
+        return (*self.table.session, *self.table.insertion, *self.table.where, *status)
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the columns of numbers, without their signs; the tip's are first."""
+        return tuple(dict.fromkeys(to_name(column) for _, column in self._columns()))
+
+    def _columns(self) -> Iterator[tuple[str, str]]:
+        """Yield the key and the column of each number but the time."""
         tip = self.tip
-        names = [*self.time.columns, *tip.position, *(tip.axis or ()), *(tip.quaternion or ())]
-        for stage in (self.guide, self.base):
-            names += [] if stage is None else [stage.y, *([stage.z] if stage.z else [])]
-        names += [self.roll.column] if self.roll else []
-        return {name.lstrip("+-") for name in names}
+        for name in ("position", "axis", "quaternion", "angle"):
+            for k, column in enumerate(getattr(tip, name) or ()):
+                yield f"tip.{name}[{k}]", column
+        for key in ("guide", "base"):
+            stage = getattr(self, key)
+            if stage is not None:
+                yield from ((f"{key}.{axis}", getattr(stage, axis)) for axis in "yz" if getattr(stage, axis))
+                yield from ((f"{key}.position[{k}]", each) for k, each in enumerate(stage.position or ()))
+        if self.roll:
+            yield "roll.column", self.roll.column
 
 
-def _unit(direction: str) -> Any:
-    vector = np.zeros(3)
-    vector["xyz".index(direction[-1])] = -1.0 if direction.startswith("-") else 1.0
-    return vector
+def to_name(column: str) -> str:
+    """Return the name of a column without its sign."""
+    return column[1:] if column[:1] in ("+", "-") and len(column) > 1 else column
 
 
-def load_map(path: Any) -> RecordingMap:
-    """Return the map of a file. Raises FileError, with one line for each problem."""
-    return MAPS.load(path, RecordingMap)
+def load_map(path: Path) -> RecordingMap:
+    """Return the map of a file. Raises FileError, with one line for each problem, and for its registration."""
+    found = MAPS.load(path, RecordingMap)
+    if found.frame.registration_file is None:
+        return found
+    given = read_registration(path.parent / found.frame.registration_file)
+    frame = found.frame.model_copy(update={"registration": given, "registration_file": None})
+    return found.model_copy(update={"frame": frame})

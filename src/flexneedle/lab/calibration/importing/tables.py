@@ -1,6 +1,6 @@
-"""Tables of recordings, whatever their format: columns of numbers by name, with text only where a map asks for it."""
+"""Tables of recordings, whatever their format: columns of numbers, times and text by name."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,178 +8,120 @@ import numpy as np
 
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError, one_line
-from flexneedle.lab.tables.layout import BLANKS, COMMENT, read_layout
-from flexneedle.types import Floats
+from flexneedle.lab.calibration.importing.bags import TIME, find_bag, read_bag
+from flexneedle.lab.calibration.importing.columns import Table, locate, to_numbers, to_seconds
+from flexneedle.lab.calibration.importing.map_file import TIMES, RecordingMap, to_name
+from flexneedle.lab.calibration.importing.text_tables import read_text
 
-Table = Mapping[str, Any]
-"""Columns (r,) by name."""
-_PARQUET, _MCAP = b"PAR1", b"\x89MCAP"
-_MAT = (b"MATLAB 5.0 MAT-file", b"\x89HDF")
+_PARQUET, _MAT, _HDF = b"PAR1", b"MATLAB 5.0 MAT-file", b"\x89HDF"
 
 
-def read_table(path: Path, numbers: Collection[str], text: Collection[str], topics: Collection[str]) -> Table:
-    """Return columns of a table: CSV, TSV, Parquet, MATLAB, MCAP or a rosbag2 folder; its content decides, not its name.
+def read_table(path: Path, recording_map: RecordingMap) -> Table:
+    """Return the columns of a map: numbers, text, and `TIME` in s if the file has times.
 
-    Raises InputError, which begins with the path, for a file that cannot be read, a missing column, or text where a
-    number should be.
+    CSV and other text, Parquet, MATLAB, MCAP or rosbag2; the content of the file decides, not its name. Raises
+    InputError, which begins with the path, for a file that cannot be read, and for missing or malformed columns.
     """
     try:
-        found = dict(_read(path, [*numbers, *text], topics))
-        missing = [name for name in (*text, *numbers) if name not in found]
-        if missing:
-            raise InputError(f"has no column {missing[0]!r}; it has {_list(found)}")
-        return {
-            name: found[name] if name in text else _numbers(name, found[name]) for name in (*text, *numbers)
-        }
-    except (OSError, InputError) as error:
+        return dict(_convert(_read(path, recording_map), recording_map))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
 
 
-def _read(path: Path, names: Collection[str], topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-    if path.is_dir():
-        return _bag(path, topics)
+def _read(path: Path, recording_map: RecordingMap) -> Table:
+    times = tuple(map(to_name, recording_map.time.columns))
+    names = dict.fromkeys((*recording_map.numbers, *times, *recording_map.text))
+    if (bag := find_bag(path)) is not None:
+        return read_bag(bag, list(names))
     with path.open("rb") as file:
-        start = file.read(32)
-    if start.startswith(_MCAP):
-        return _bag(path, topics)
+        start = file.read(len(_MAT))
+    if not start:
+        raise InputError("is empty")
+    if start.startswith(_HDF):
+        raise InputError("is a MATLAB file of version 7.3: save it with the option -v7")
     if start.startswith(_PARQUET):
-        return _parquet(path, names)
+        return _read_parquet(path, list(names))
     if start.startswith(_MAT):
-        return _matlab(path)
-    return _csv(path, names)
+        return _read_matlab(path, list(names))
+    return read_text(path, recording_map.numbers, times, recording_map.text, recording_map.table)
 
 
-def _csv(path: Path, names: Collection[str]) -> Iterator[tuple[str, Any]]:
-    require_extra("study", "pyarrow")
-    from pyarrow import ArrowInvalid, csv
-
-    layout = read_layout(path)
-    if layout.separator == BLANKS:
-        raise InputError("has columns with blanks between them: write commas or tabs")
-    if repeated := {name for name in layout.header if layout.header.count(name) > 1} & {*names}:
-        raise InputError(f"has two columns {min(repeated)!r}")
-    try:
-        rows = csv.read_csv(
-            path,
-            csv.ReadOptions(skip_rows=layout.skipped + 1, column_names=list(layout.header)),
-            csv.ParseOptions(delimiter=layout.separator, invalid_row_handler=_skip_comment),
-            csv.ConvertOptions(include_columns=[name for name in layout.header if name in names]),
-        )
-    except ArrowInvalid as error:
-        raise InputError(one_line(error)) from None
-    for name in layout.header:
-        yield name, rows[name].to_numpy() if name in rows.column_names else None
+def _convert(columns: Table, recording_map: RecordingMap) -> Iterator[tuple[str, Any]]:
+    time, missing = recording_map.time, recording_map.table.missing
+    for name in recording_map.text:
+        yield name, np.array(["" if each is None else str(each).strip() for each in columns[name].tolist()])
+    for name in recording_map.numbers:
+        yield name, to_numbers(name, columns[name], missing)
+    units = zip(time.columns, (time.unit, time.second_unit), strict=False)
+    found = [to_seconds(to_name(name), columns[to_name(name)], TIMES[unit]) for name, unit in units]
+    if found:
+        yield TIME, sum(found)
+    elif TIME in columns:
+        yield TIME, columns[TIME]
 
 
-def _skip_comment(row: Any) -> str:
-    return "skip" if str(row.text).startswith(COMMENT) else "error"
-
-
-def _parquet(path: Path, names: Collection[str]) -> Iterator[tuple[str, Any]]:
+def _read_parquet(path: Path, names: Sequence[str]) -> Table:
     require_extra("study", "pyarrow")
     from pyarrow import ArrowInvalid
     from pyarrow.parquet import ParquetFile
 
     try:
         with ParquetFile(path) as file:
-            kept = [name for name in file.schema_arrow.names if name in names]
-            rows = file.read(columns=kept)
-            for name in file.schema_arrow.names:
-                yield name, rows[name].to_numpy() if name in kept else None
-    except ArrowInvalid as error:
-        raise InputError(one_line(error)) from None
+            places = locate(names, file.schema_arrow.names)
+            rows = file.read()
+    except (ArrowInvalid, OSError):
+        raise InputError("is a truncated or damaged Parquet file") from None
+    return {name: rows.column(place).to_numpy() for name, place in places.items()}
 
 
-def _matlab(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield vectors by variable or STRUCT.FIELD, and the columns of matrices as NAME[1], NAME[2] …"""
+def _read_matlab(path: Path, names: Sequence[str]) -> Table:
+    """Return vectors by variable or STRUCT.FIELD, and columns of matrices as NAME[1] and so on."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
     try:
         variables = loadmat(path, squeeze_me=True, simplify_cells=True)
-    except (MatReadError, NotImplementedError, ValueError) as error:
-        hint = " (version 7.3: save it with -v7)" if isinstance(error, NotImplementedError) else ""
-        raise InputError(f"cannot be read{hint}: {error}") from None
-    for name, value in _flatten({key: value for key, value in variables.items() if not key.startswith("__")}):
-        array = np.asarray(value)
-        if array.ndim == 1:
-            yield name, array
-        elif array.ndim == 2:
-            for k, column in enumerate(array.T, 1):
-                yield f"{name}[{k}]", column
+    except (MatReadError, NotImplementedError, ValueError, TypeError, EOFError) as error:
+        raise InputError(f"is a damaged MATLAB file: {error}") from None
+    if "__function_workspace__" in variables:
+        raise InputError(
+            "has MATLAB objects such as tables: save struct arrays, as by table2struct(T, 'ToScalar', true)"
+        )
+    found = dict(_vectors({key: value for key, value in variables.items() if not key.startswith("__")}))
+    places = locate(names, list(found))
+    columns = {name: list(found.values())[place] for name, place in places.items()}
+    sizes = {name: len(column) for name, column in columns.items()}
+    for name, size in sizes.items():
+        if size != sizes[names[0]]:
+            raise InputError(f"column {name!r} has {size} rows, and {names[0]!r} has {sizes[names[0]]}")
+    return columns
 
 
-def _flatten(values: Mapping[str, Any], opening: str = "") -> Iterator[tuple[str, Any]]:
+def _vectors(values: Mapping[str, Any], opening: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield columns by name. A struct array yields the rows of its elements, and their numbers from 1 as its name."""
     for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{opening}{key}.")
+        name = opening + key
+        if isinstance(value, Mapping):
+            yield from _vectors(value, f"{name}.")
+        elif isinstance(value, list | np.ndarray) and len(np.shape(value)) and _are_structs(value):
+            yield from _stack(name, [dict(_vectors(each)) for each in value])
         else:
-            yield opening + key, value
+            array = np.asarray(value)
+            if array.ndim == 1:
+                yield name, array
+            elif array.ndim == 2:
+                yield from ((f"{name}[{k}]", column) for k, column in enumerate(array.T, 1))
 
 
-def _bag(path: Path, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the columns of pose topics: time_s of the first, and TOPIC.x … TOPIC.qw, the newest at each time."""
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
-
-    if not topics:
-        raise InputError("is a bag: name its pose topics as table.topics")
-    series: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            known = {connection.topic for connection in reader.connections}
-            if absent := [topic for topic in topics if topic not in known]:
-                raise InputError(f"has no topic {absent[0]}; it has {_list(sorted(known))}")
-            chosen = [each for each in reader.connections if each.topic in series]
-            for connection, stamp, raw in reader.messages(chosen):
-                message = reader.deserialize(raw, connection.msgtype)
-                series[connection.topic].append((*_time_and_pose(message, stamp),))
-    except AnyReaderError as error:
-        raise InputError(f"cannot be read: {error}") from None
-    first = np.array(series[next(iter(topics))]).reshape(-1, 8)
-    yield "time_s", first[:, 0]
-    for topic, rows in series.items():
-        values = np.array(rows).reshape(-1, 8)
-        if not len(values):
-            raise InputError(f"has no message on {topic}")
-        newest = np.searchsorted(values[:, 0], first[:, 0], side="right") - 1
-        for name, column in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values[:, 1:].T, strict=True):
-            yield f"{topic}.{name}", np.where(newest >= 0, column[newest], np.nan)
+def _are_structs(values: Any) -> bool:
+    return len(values) > 0 and all(isinstance(each, Mapping) for each in values)
 
 
-def _time_and_pose(message: Any, stamp: int) -> Iterator[float]:
-    """Yield time (s), position and orientation of a message with a pose, a transform, a point or joint positions."""
-    header = getattr(message, "header", None)
-    seconds = 1e-9 * stamp if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
-    body = next(
-        (getattr(message, name) for name in ("pose", "transform", "point") if hasattr(message, name)), message
-    )
-    body = getattr(body, "pose", body)
-    place = next((getattr(body, name) for name in ("position", "translation") if hasattr(body, name)), body)
-    turn = next((getattr(body, name) for name in ("orientation", "rotation") if hasattr(body, name)), None)
-    yield float(seconds)
-    try:
-        yield from (float(place.x), float(place.y), float(place.z))
-    except AttributeError:
-        raise InputError(f"has messages without a pose: {type(message).__name__}") from None
-    yield from (np.nan,) * 4 if turn is None else (float(turn.x), float(turn.y), float(turn.z), float(turn.w))
-
-
-def _numbers(name: str, values: Any) -> Floats:
-    """Return a column of numbers, NaN where it is empty. Raises InputError for text."""
-    array = np.asarray(values)
-    if array.dtype.kind in "fiub":
-        return array.astype(float)
-    found = np.full(len(array), np.nan)
-    for row, value in enumerate(array.tolist()):
-        if value not in (None, ""):
-            try:
-                found[row] = float(value)
-            except (TypeError, ValueError):
-                raise InputError(f"column {name!r}, row {row + 1}: {value!r} is not a number") from None
-    return found
-
-
-def _list(names: Collection[str], most: int = 12) -> str:
-    shown = [repr(name) for name in names][:most]
-    return ", ".join(shown) + (f" and {len(names) - most} more" if len(names) > most else "")
+def _stack(name: str, elements: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, Any]]:
+    longest = [max(map(len, each.values()), default=0) for each in elements]
+    yield name, np.repeat(np.arange(1, len(elements) + 1), longest)
+    for key in elements[0]:
+        if all(key in each for each in elements):
+            yield f"{name}.{key}", np.concatenate([each[key] for each in elements])

@@ -1,0 +1,62 @@
+"""Recorded insertions with a known path: a bevel that curves it, a guide that turns the tip, a sensor with noise."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+CURVATURE = np.array([6e-4, -3e-4])  # 1/mm, along y and z
+RESPONSE = -0.02  # rad/mm: turn of the tip for a motion of the guide
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Steps of an insertion in the needle's frame: depth (k,), lateral offset, slope and guide (k, 2), mm and rad."""
+
+    depth: np.ndarray
+    position: np.ndarray
+    slope: np.ndarray
+    guide: np.ndarray
+
+    @property
+    def points(self):
+        return np.column_stack([self.depth, self.position])
+
+    @property
+    def axis(self):
+        axis = np.column_stack([np.ones(len(self.depth)), self.slope])
+        return axis / np.linalg.norm(axis, axis=1, keepdims=True)
+
+
+def guided(steps=18, advance=5.0, seed=0, moves=3.0):
+    """Return a path whose guide moves before each advance by up to `moves` mm."""
+    random = np.random.default_rng(seed)
+    guide = np.vstack([np.zeros(2), random.uniform(-moves, moves, (steps - 1, 2))])
+    depth = advance * np.arange(steps)
+    turns = RESPONSE * np.exp(-depth[1:, None] / 60.0) * np.diff(guide, axis=0)
+    slope = np.vstack([np.zeros(2), np.cumsum(CURVATURE * advance + turns, axis=0)])
+    position = np.vstack([np.zeros(2), np.cumsum(0.5 * advance * (slope[1:] + slope[:-1]), axis=0)])
+    return Path(depth, position, slope, guide)
+
+
+def stream(path, rate=40.0, speed=5.0, rest=2.0, noise=0.0, seed=0):
+    """Return times (r,), points (r, 3) and guide (r, 2) of a stop-and-go insertion along a path.
+
+    The guide moves at `speed` at rest, then the tip advances.
+    """
+    random = np.random.default_rng(seed)
+    times, points, guides = [0.0, rest], [path.points[0]] * 2, [path.guide[0]] * 2
+    for k in range(1, len(path.depth)):
+        for point, guide in ((path.points[k - 1], path.guide[k]), (path.points[k], path.guide[k])):
+            length = np.linalg.norm(point - points[-1]) + np.linalg.norm(guide - guides[-1])
+            times.append(times[-1] + length / speed)
+            points.append(point)
+            guides.append(guide)
+        times.append(times[-1] + rest)
+        points.append(path.points[k])
+        guides.append(path.guide[k])
+    time = np.arange(0.0, times[-1], 1.0 / rate)
+    tip, moved = (
+        np.stack([np.interp(time, times, each) for each in np.array(values).T], axis=1)
+        for values in (points, guides)
+    )
+    return time, tip + noise * random.standard_normal(tip.shape), moved
