@@ -60,3 +60,45 @@ def stream(path, rate=40.0, speed=5.0, rest=2.0, noise=0.0, seed=0):
         for values in (points, guides)
     )
     return time, tip + noise * random.standard_normal(tip.shape), moved
+
+
+PLAIN = {
+    "tip": {"position": ["x", "y", "z"], "axis": ["ax", "ay", "az"]},
+    "guide": {"y": "gy", "z": "gz"},
+}
+"""Map of `columns` in the needle's frame."""
+
+
+def columns(path):
+    """Return the columns t, x, y, z, ax, ay, az, gy, gz of the steps of a path, 10 s apart."""
+    values = np.column_stack([path.points, path.axis, path.guide]).T
+    names = ("x", "y", "z", "ax", "ay", "az", "gy", "gz")
+    return {"t": 10.0 * np.arange(len(path.depth)), **dict(zip(names, values, strict=True))}
+
+
+def write_csv(file, table, separator=",", before="", after="", decimal="."):
+    """Write columns as text: lines before their names, and after the rows."""
+    rows = [
+        separator.join(str(value).replace(".", decimal) for value in row)
+        for row in zip(*table.values(), strict=True)
+    ]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"{before}{separator.join(table)}\n" + "\n".join(rows) + f"\n{after}", encoding="utf-8")
+    return file
+
+
+def load(*files, **sections):
+    """Return the import of files with a map of these sections, `PLAIN` unless given."""
+    from flexneedle.lab.calibration.importing.importer import import_recordings
+    from flexneedle.lab.calibration.importing.map_file import RecordingMap
+
+    given = {key: value for key, value in (PLAIN | sections).items() if value is not None}
+    return import_recordings(files, RecordingMap.model_validate(given))
+
+
+def assert_steps(recording, path, atol=1e-6):
+    """Assert that a recording has the steps of a path."""
+    axes = recording.axes
+    np.testing.assert_allclose(recording.depth, path.depth - path.depth[0], atol=atol)
+    np.testing.assert_allclose(recording.position, (path.position - path.position[0])[:, :axes], atol=atol)
+    np.testing.assert_allclose(recording.guide, (path.guide - path.guide[0])[:, :axes], atol=atol)

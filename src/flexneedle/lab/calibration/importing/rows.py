@@ -54,8 +54,9 @@ class Rows:
     def with_table(self, table: Floats) -> "Rows":
         """Return the rows of a table (k, c)."""
         parts = np.split(table, np.cumsum([*_ARRAYS.values()])[:-1], axis=1)
-        arrays = {
-            name: part if part.shape[1] > 1 else part[:, 0] for name, part in zip(_ARRAYS, parts, strict=True)
+        arrays: Any = {
+            name: part if size > 1 else part[:, 0]
+            for (name, size), part in zip(_ARRAYS.items(), parts, strict=True)
         }
         return replace(self, **arrays)
 

@@ -18,9 +18,8 @@ from flexneedle.lab.tables.layout import (
     has_decimal_commas,
     open_text,
     read_layout,
-    split_line,
 )
-from flexneedle.lab.tables.plain_copy import EMPTY, is_regular, write_copy
+from flexneedle.lab.tables.plain_copy import EMPTY, write_copy
 
 _EMPTY = [spelling for text in EMPTY for spelling in dict.fromkeys((text, text.upper(), text.title(), "NaN"))]
 
@@ -30,7 +29,7 @@ def read_text(
 ) -> dict[str, Any]:
     """Return columns of a text table: numbers, times of a kind that their text shows, and text.
 
-    A file of regular lines is read by Arrow; others, and those with an error, line by line. Raises InputError.
+    Arrow reads a file of regular lines; another one is read line by line. Raises InputError.
     """
     require_extra("study", "pyarrow")
     names = dict.fromkeys((*numbers, *times, *text))
@@ -53,10 +52,9 @@ def _read_separated(
     clocks = _clocks(path, layout, {name: places[name] for name in times})
     kinds = {places[name]: "text" if name in text else clocks.get(name, "number") for name in names}
     try:
-        found = _read_regular(path, layout, kinds)
+        columns = _read_directly(path, layout, kinds)
     except ArrowInvalid:
-        found = None
-    columns = found or _read_copy(path, layout, kinds)
+        columns = _read_copy(path, layout, kinds)
     return {name: columns[place] for name, place in places.items()}
 
 
@@ -75,7 +73,7 @@ def _clocks(path: Path, layout: CsvLayout, places: dict[str, int]) -> dict[str, 
     """Return which columns of times are dates or times of day, by the first row."""
     with open_text(path) as file:
         line = next(islice(file, layout.skipped + 1, None), "").strip()
-    fields = split_line(line, layout.separator) if places else []
+    fields = line.replace(chr(34), "").split(layout.separator)
     return {
         name: "clock"
         for name, k in places.items()
@@ -83,10 +81,8 @@ def _clocks(path: Path, layout: CsvLayout, places: dict[str, int]) -> dict[str, 
     }
 
 
-def _read_regular(path: Path, layout: CsvLayout, kinds: dict[int, str]) -> dict[int, Any] | None:
-    """Return columns by place; None if a line is not regular."""
-    if not is_regular(path, replace(layout, skipped=layout.skipped + 1)):
-        return None
+def _read_directly(path: Path, layout: CsvLayout, kinds: dict[int, str]) -> dict[int, Any]:
+    """Return columns by place. Raises ArrowInvalid if a line has other fields than the header, or text for a number."""
     numbers = {layout.header[k] for k, kind in kinds.items() if kind == "number"}
     mark = "," if has_decimal_commas(path, layout, numbers) else "."
     names = [f"c{k}" for k in range(len(layout.header))]
