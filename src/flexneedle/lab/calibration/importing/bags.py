@@ -27,6 +27,10 @@ class _Column(NamedTuple):
 def find_bag(path: Path) -> Path | None:
     """Return the path to open for a bag: a file, or the folder of rosbag2; None for another file."""
     if path.is_dir():
+        if not (path / "metadata.yaml").is_file():
+            raise InputError(
+                "is a folder without metadata.yaml or run.json: name a bag, a run or the files in the folder"
+            )
         return path
     with path.open("rb") as file:
         start = file.read(len(_SQLITE))

@@ -133,7 +133,7 @@ class StageMap(Section):
     @model_validator(mode="after")
     def _check_columns(self) -> Self:
         if (self.position is None) == (self.y is None and self.z is None):
-            refuse([Problem("", None, "must have y, z or both; or position alone")])
+            refuse([Problem((), None, "must have y, z or both; or position alone")])
         return self
 
 

@@ -11,7 +11,7 @@ from flexneedle.lab.calibration.session import GuideOrder, Recording
 from flexneedle.record.folder import RUN_FILE, TRACE_FILE
 from flexneedle.record.loading import load_insertion
 from flexneedle.results import Insertion
-from flexneedle.types import DB_Y, DG_Y, ROLL, SPIN, Floats
+from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN, Floats
 
 GUIDE_ORDER: GuideOrder = "with"
 """Guide and base move during the advance of a control period."""
@@ -88,11 +88,15 @@ def _times(done: Insertion) -> Floats:
 
 
 def _stages(done: Insertion) -> Floats:
-    """Return guide y, z, base y, z and roll (p + 1, 5) at the start and after each period."""
-    rows = np.array([(*one.guide, one.base.y, one.base.z, one.roll) for one in done.periods])
-    first = np.array(done.periods[0].applied)
-    start = rows[0] - [*first[DG_Y : DG_Y + 2], *first[DB_Y : DB_Y + 2], first[ROLL] + first[SPIN]]
-    return np.vstack([start, rows])
+    """Return guide y, z, base y, z and roll (p + 1, 5) at the start and after each period, as applied.
+
+    The base of a period is an estimate, which readings correct.
+    """
+    steps = np.array([period.applied for period in done.periods])
+    moved = np.column_stack([steps[:, [DG_Y, DG_Z, DB_Y, DB_Z]], steps[:, ROLL] + steps[:, SPIN]])
+    start = np.array([0.0, 0.0, 0.0, 0.0, done.plan.roll])
+    stages: Floats = start + np.vstack([np.zeros(5), np.cumsum(moved, axis=0)])
+    return stages
 
 
 def _notes(done: Insertion, note: str) -> Iterator[str]:
@@ -103,8 +107,6 @@ def _notes(done: Insertion, note: str) -> Iterator[str]:
         yield "a dry run: its readings are simulated"
     if done.disturbed:
         yield f"disturbed by a person: {done.disturbed}"
-    tilt = max(
-        np.ptp([one.base.theta for one in done.periods]), np.ptp([one.base.psi for one in done.periods])
-    )
-    if tilt > _TILT_RAD:
-        yield f"the base turns by {1e3 * tilt:.3g} mrad, which a session does not contain"
+    turns = np.cumsum([period.applied for period in done.periods], axis=0)[:, [DB_THETA, DB_PSI]]
+    if np.abs(turns).max() > _TILT_RAD:
+        yield f"the base turns by {1e3 * np.abs(turns).max():.3g} mrad, which a session does not contain"

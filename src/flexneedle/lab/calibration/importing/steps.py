@@ -44,7 +44,7 @@ def _check_rows(rows: Rows, steps: StepMap) -> None:
         )
     jumps = np.linalg.norm(np.diff(rows.position, axis=0), axis=1)
     if jumps.max(initial=0.0) > steps.gap_mm:
-        row = int(jumps.argmax())
+        row = int((jumps > steps.gap_mm).argmax())
         place = ", ".join(f"{each:.4g}" for each in rows.position[row + 1])
         raise InputError(
             f"{rows.source}: the tip jumps by {jumps[row]:.4g} mm to ({place}), more than steps.gap_mm = "
