@@ -9,7 +9,7 @@ RESPONSE = -0.02  # rad/mm: turn of the tip for a motion of the guide
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class KnownPath:
     """Steps of an insertion in the needle's frame: depth (k,), lateral offset, slope and guide (k, 2), mm and rad."""
 
     depth: np.ndarray
@@ -35,7 +35,7 @@ def guided(steps=18, advance=5.0, seed=0, moves=3.0):
     turns = RESPONSE * np.exp(-depth[1:, None] / 60.0) * np.diff(guide, axis=0)
     slope = np.vstack([np.zeros(2), np.cumsum(CURVATURE * advance + turns, axis=0)])
     position = np.vstack([np.zeros(2), np.cumsum(0.5 * advance * (slope[1:] + slope[:-1]), axis=0)])
-    return Path(depth, position, slope, guide)
+    return KnownPath(depth, position, slope, guide)
 
 
 def stream(path, rate=40.0, speed=5.0, rest=2.0, noise=0.0, seed=0):

@@ -14,9 +14,11 @@ import pytest
 import command_reference
 import flexneedle
 import math_fence
+import recording_reference
 import rig_reference
 import rig_states
 import scenario_reference
+from flexneedle.lab.calibration.importing.map_file import RecordingMap
 from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.files import load_scenario
@@ -34,7 +36,9 @@ def entries(nav: object) -> Iterator[str]:
         yield from [item] if isinstance(item, str) else entries(*item.values())
 
 
-@pytest.mark.parametrize("generator", [scenario_reference, rig_reference, command_reference])
+@pytest.mark.parametrize(
+    "generator", [scenario_reference, rig_reference, recording_reference, command_reference]
+)
 def test_generated_pages_are_up_to_date(generator):
     assert generator.PAGE.read_text(encoding="utf-8") == generator.page(), "make docs"
 
@@ -61,6 +65,15 @@ def test_the_rig_of_the_reference_can_do_what_the_paper_needs(tmp_path):
     path = tmp_path / example.title
     path.write_text(example.code, encoding="utf-8")
     assert fit_problems(load_rig(path), load_scenario("phantom")) == []
+
+
+def test_the_examples_of_maps_are_maps_and_every_key_has_a_description():
+    page = recording_reference.PAGE.read_text(encoding="utf-8")
+    for block in blocks(page):
+        if block.title:
+            RecordingMap.model_validate(tomllib.loads(block.code))
+    shown = list(scenario_reference.tables(RecordingMap.model_json_schema()))
+    assert all(key.schema.get("description") for table in shown for key in table.keys)
 
 
 def test_every_section_has_advice_and_every_key_a_description():

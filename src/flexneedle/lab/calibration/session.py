@@ -19,7 +19,7 @@ from flexneedle.types import Floats
 
 STEPS_FILE, SESSION_FILE = "steps.parquet", "session.toml"
 GuideOrder = Literal["before", "with", "after"]
-"""Whether the guide moves before, with or after the advance from a step to the next."""
+"""Motion of the guide before, with or after the advance from a step to the next."""
 _FORMAT = 1
 _ACROSS = ("y", "z")
 _NUMBERS = ("position", "slope", "guide", "base")

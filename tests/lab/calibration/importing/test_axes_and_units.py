@@ -101,7 +101,7 @@ def test_a_plane_of_a_tracker_in_space(tmp_path):
 def test_registration_and_a_guide_in_the_axes_of_the_tracker(tmp_path):
     turn = Rotation.from_euler("zyx", [0.4, -1.1, 2.0])
     shift = np.array([120.0, -40.0, 15.0])
-    points = turn.inv().apply(PATH.points + [7.0, 1.0, 2.0] - shift)
+    points = turn.inv().apply(PATH.points + np.array([7.0, 1.0, 2.0]) - shift)
     guide = turn.inv().apply(np.column_stack([np.full(18, -20.0), PATH.guide]) - shift)
     axis = turn.inv().apply(PATH.axis)
     table = dict(zip("xyzabcuvw", np.hstack([points, guide, axis]).T, strict=True))

@@ -59,7 +59,7 @@ def test_a_table_without_a_header(tmp_path):
     file = tmp_path / "gel.txt"
     np.savetxt(file, np.column_stack([*TABLE.values()]))
     assert_steps(load(file, table={"columns": [*TABLE]}).session.recordings[0], PATH)
-    with pytest.raises(InputError, match="has 9 columns, and table.columns names 8"):
+    with pytest.raises(InputError, match=r"has 9 columns, and .* names 8"):
         load(file, table={"columns": [*TABLE][1:]})
 
 
@@ -73,7 +73,7 @@ def test_sensors_side_by_side_with_the_same_names(tmp_path):
     file = tmp_path / "two.csv"
     file.write_text("\n".join(lines))
     assert_steps(load(file, tip={"position": ["x[2]", "y[2]", "z[2]"]}).session.recordings[0], PATH)
-    with pytest.raises(InputError, match=r"two.csv: has 2 columns 'x': choose one as 'x\[1\]' to 'x\[2\]'"):
+    with pytest.raises(InputError, match=r"two\.csv: has 2 columns 'x': choose one as 'x\[1\]' to 'x\[2\]'"):
         load(file)
 
 
@@ -113,7 +113,7 @@ def test_matlab_vectors_matrices_and_structs(tmp_path):
 
 def test_matlab_struct_arrays_are_insertions(tmp_path):
     paths = [guided(seed=1), guided(steps=12, seed=2)]
-    trials = np.array([{name: values for name, values in columns(path).items()} for path in paths])
+    trials = np.array([columns(path) for path in paths])
     savemat(tmp_path / "gel.mat", {"trials": trials})
     named = {
         "tip": {"position": ["trials.x", "trials.y", "trials.z"]},

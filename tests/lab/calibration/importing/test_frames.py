@@ -10,6 +10,7 @@ from recorded_insertions import RESPONSE, columns, guided, load, write_csv
 
 FITTED = {"frame": {"x": "fit", "y": "fit"}}
 X_DEG, Y_DEG = 1.0, 5.0
+ORIGIN = np.array([100.0, -20.0, 5.0])
 
 
 def write_turned(folder, turn, paths, slopes=True):
@@ -17,7 +18,7 @@ def write_turned(folder, turn, paths, slopes=True):
     for k, path in enumerate(paths):
         noise = 0.05 * np.random.default_rng(k).standard_normal((len(path.depth), 3))
         points, axis = (
-            turn.inv().apply(path.points + noise) + [100.0, -20.0, 5.0],
+            turn.inv().apply(path.points + noise) + ORIGIN,
             turn.inv().apply(path.axis),
         )
         table = columns(path)
@@ -64,7 +65,7 @@ def test_a_guide_along_one_axis_gives_y(tmp_path):
 def test_a_guide_that_rests_does_not_give_y(tmp_path):
     files = write_turned(tmp_path, Rotation.identity(), [guided(moves=0.0)])
     with pytest.raises(
-        InputError, match='frame.y = "fit" needs 6 motions of the guide that turn the tip: name the axis'
+        InputError, match=r'frame\.y = "fit" needs 6 motions of the guide that turn the tip: name the axis'
     ):
         load(*files, **FITTED)
 

@@ -22,7 +22,7 @@ def test_import_prints_what_it_understood_and_writes_a_session(tmp_path, capsys)
         "depth 0 to 85 mm",
         "lateral offset -1.78 to 2.56 mm",
         "slope of the needle at the tip -52.5 to 59.5 mrad",
-        "the guide moves in 3 of 3 insertions, by up to 4.05 mm",
+        "the guide moves in 3 of 3 insertions, by up to 4.15 mm",
         "the base moves in 0 of 3 insertions",
         "the needle is rotated in 0 of 3 insertions",
         "",

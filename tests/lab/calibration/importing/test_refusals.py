@@ -57,6 +57,11 @@ def rest(folder):
 
 
 GOOD = csv(TABLE)
+ONLY_TIP = {"tip": {"position": ["x", "y", "z"]}, "guide": None}
+TWICE = {"registration_file": "r", "registration": {"fiducials_mm": FIDUCIALS}}
+TWO_DEPTHS = {"skin_mm": 1.0, "first_depth_mm": 2.0}
+FLAT = {"tip": {"position": ["x", "y"]}, "frame": {"x": "z"}}
+NAMED = {"table": {"insertion": ["n"]}}
 STREAM = {"steps": {"rows": "stream"}}
 
 REFUSALS = {
@@ -70,19 +75,19 @@ REFUSALS = {
     "hdf": (text(b"\x89HDF\r\n\x1a\n" + bytes(99)), {}, "version 7.3: save it with the option -v7"),
     "parquet cut": (text(b"PAR1" + bytes(99)), {}, "a.csv: is a truncated or damaged Parquet file"),
     "matlab cut": (text(b"MATLAB 5.0 MAT-file" + bytes(200)), {}, "a.csv: is a damaged MATLAB file"),
-    "bag cut": (text(b"\x89MCAP0\r\n" + bytes(50)), {}, "a.csv: is a bag that cannot be read"),
+    "bag cut": (text(b"\x89MCAP0\r\n" + bytes(50)), {}, "a.csv: is a damaged or unfinished bag"),
     "folder": (lambda folder: (folder / "a").mkdir(), {}, "a: is a folder without metadata.yaml or run.json"),
     "other run": (rest, {}, "run.json: not a run of this version of flexneedle: format must be 1"),
     # Columns
     "missing column": (csv({"X" + k: v for k, v in TABLE.items()}), {}, "has no column 'x'"),
     "misspelt": (GOOD, {"tip": {"position": ["x", "y", "zz"]}}, "has no column 'zz'; did you mean 'z'?"),
-    "two of a name": (text("x,x,y,z\n" + 9 * "1,2,3,4\n"), {"tip": {"position": ["x", "y", "z"]}, "guide": None}, "has 2 columns 'x'"),
+    "two of a name": (text("x,x,y,z\n" + 9 * "1,2,3,4\n"), ONLY_TIP, "has 2 columns 'x'"),
     "text": (csv(changed(y={3: "abc"})), {}, "a.csv: line 5: y: 'abc' is not a number"),
-    "infinity": (csv(changed(y={3: "inf"})), {}, "a.csv: column 'y', row 4: must be a finite number"),
-    "short line": (text("x,y,z\n" + "1,2,3\n" * 5 + "1,2\n"), {"tip": {"position": ["x", "y", "z"]}, "guide": None}, "a.csv: line 7: has fewer fields than the header"),
-    "decimal commas": (text("x,y,z\n" + "1,5,2,5,3,5\n" * 9), {"tip": {"position": ["x", "y", "z"]}, "guide": None}, "decimal commas need semicolons or tabs"),
+    "infinity": (csv(changed(y={3: "inf"})), {}, "a.csv: column 'y', row 4: inf must be a finite number up to 1e+12"),
+    "short line": (text("x,y,z\n" + "1,2,3\n" * 5 + "1,2\n"), ONLY_TIP, "line 7: has fewer fields than the header"),
+    "decimal commas": (text("x,y,z\n" + "1,5,2,5,3,5\n" * 9), ONLY_TIP, "decimal commas need semicolons or tabs"),
     "time": (csv(TABLE | {"t": ["noon"] * 18}), {"time": {"columns": ["t"]}}, "'noon' is not a number"),
-    "matlab rows": (mat(x=np.arange(9), y=np.arange(9), z=np.arange(8)), {"tip": {"position": ["x", "y", "z"]}, "guide": None}, "column 'z' has 8 rows, and 'x' has 9"),
+    "matlab rows": (mat(x=np.arange(9), y=np.arange(9), z=np.arange(8)), ONLY_TIP, "has 8 rows, and 'x' has 9"),
     "parquet lists": (parquet(TABLE | {"x": [[1.0]] * 18}), {}, "column 'x'"),
     "no such row": (GOOD, {"table": {"where": {"t": "tip"}}}, "a.csv: no row has t = 'tip'"),
     # Recordings that contradict themselves
@@ -91,29 +96,29 @@ REFUSALS = {
     "jump": (csv(changed(y={4: "400"})), {}, "a.csv: the tip jumps by 399.9 mm to (20, 400,"),
     "no advance": (GOOD, {"frame": {"x": "y", "y": "x"}}, "mm along x = y, and more along another axis: check frame.x"),
     "backwards": (GOOD, {"frame": {"x": "-x", "y": "y"}}, "a.csv: the tip advances 0 mm along x = -x"),
-    "axis across": (GOOD, {"tip": TIP | {"axis": ["ay", "ax", "az"]}}, "a.csv: the sensor's axis is 88° off the path"),
-    "axis length": (csv(changed(ax={2: "0.5"})), {}, "a.csv: row 3: the needle's axis must have the length 1, not 0.5"),
+    "axis across": (GOOD, {"tip": TIP | {"axis": ["ay", "ax", "az"]}}, "the sensor's axis is 88° off the path"),
+    "axis length": (csv(changed(ax={2: "0.5"})), {}, "row 3: the needle's axis must have the length 1, not 0.5"),
     "quaternion length": (GOOD, {"tip": QUATERNION, "guide": None}, "the quaternion must have the length 1"),
     "no times": (GOOD, STREAM, "a.csv: a stream needs the time of each row: set time.columns"),
     "no rests": (GOOD, STREAM | {"time": {"columns": ["t"]}}, "no insertion has 4 steps: check the map"),
     "twice": (two, {}, "insertion a of session"),
-    "apart": (csv(TABLE | {"n": [*"aabbaabb", *"c" * 10]}), {"table": {"insertion": ["n"]}}, "insertion a: its rows are not together"),
-    "no name": (csv(TABLE | {"n": ["", *"a" * 17]}), {"table": {"insertion": ["n"]}}, "a.csv: row 1: names no insertion"),
+    "apart": (csv(TABLE | {"n": [*"aabbaabb", *"c" * 10]}), NAMED, "insertion a: its rows are not together"),
+    "no name": (csv(TABLE | {"n": ["", *"a" * 17]}), NAMED, "a.csv: row 1: names no insertion"),
     # Maps that contradict themselves
     "no map": (GOOD, None, "a.csv: is no run folder: give the map of its columns with --map"),
     "no tip": (GOOD, {"tip": None}, "lab.toml: tip: missing"),
-    "unit": (GOOD, {"tip": TIP | {"unit": "miles"}}, 'lab.toml: tip.unit = "miles": must be one of mm, cm, m, um, inch'),
+    "unit": (GOOD, {"tip": TIP | {"unit": "miles"}}, 'tip.unit = "miles": must be one of mm, cm, m, um, inch'),
     "key": (GOOD, {"tip": TIP | {"units": "mm"}}, "lab.toml: tip.units = \"mm\": unknown key; did you mean unit?"),
-    "one column": (GOOD, {"tip": {"position": ["x"]}}, "lab.toml: tip.position = [\"x\"]: must have at least 2 entries"),
+    "one column": (GOOD, {"tip": {"position": ["x"]}}, "tip.position = [\"x\"]: must have at least 2 entries"),
     "axis and angle": (GOOD, {"tip": TIP | {"angle": ["gy"]}}, "tip.angle = [\"gy\"]: not beside axis: keep one"),
     "used twice": (GOOD, {"guide": {"y": "x"}}, 'guide.y = "x": is the column of tip.position[0], too'),
     "no side": (GOOD, {"guide": {"unit": "mm"}}, "lab.toml: guide: must have y, z or both; or position alone"),
     "axes": (GOOD, {"frame": {"x": "y", "y": "-y"}}, 'frame.y = "-y": must be another axis than x (y)'),
     "direction": (GOOD, {"frame": {"x": "up"}}, 'frame.x = "up": must be an axis with its sign, "x", "-y" …, or "fit"'),
-    "two depths": (GOOD, {"frame": {"skin_mm": 1.0, "first_depth_mm": 2.0}}, "frame.first_depth_mm = 2.0: not beside skin_mm"),
-    "plane and z": (GOOD, {"tip": {"position": ["x", "y"]}, "frame": {"x": "z"}}, "frame: x and y must be the axes x and y"),
+    "two depths": (GOOD, {"frame": TWO_DEPTHS}, "frame.first_depth_mm = 2.0: not beside skin_mm"),
+    "plane and z": (GOOD, FLAT, "frame: x and y must be the axes x and y"),
     "every": (GOOD, {"steps": {"every_mm": 5.0}}, 'steps.every_mm = 5.0: needs rows = "stream"'),
-    "two registrations": (GOOD, {"frame": {"registration_file": "r", "registration": {"fiducials_mm": FIDUCIALS}}}, "not beside registration"),
+    "two registrations": (GOOD, {"frame": TWICE}, "not beside registration"),
     "no registration": (GOOD, {"frame": {"registration_file": "other.toml"}}, "other.toml: no such file"),
 }  # fmt: skip
 

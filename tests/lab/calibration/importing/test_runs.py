@@ -78,13 +78,13 @@ def test_runs_and_tables_have_one_order_of_motions(run, tmp_path):
     folder, _ = run
     file = write_csv(tmp_path / "a.csv", columns(guided()))
     with pytest.raises(
-        InputError, match='moves "with" the advance, and steps.guide = "before": import runs sep'
+        InputError, match=r'moves "with" the advance, and steps\.guide = "before": import runs sep'
     ):
         load(folder, file)
     plane = load_axes(folder)
     both = load(folder, file, steps={"guide": "with"}, frame={"plane": plane == 1}).session
     assert len(both.recordings) == 2
-    with pytest.raises(InputError, match="lateral axes, and .*: import them separately"):
+    with pytest.raises(InputError, match=r"lateral axes, and .*: import them separately"):
         load(folder, file, steps={"guide": "with"}, frame={"plane": plane == 2})
 
 

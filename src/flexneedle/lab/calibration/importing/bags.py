@@ -3,17 +3,20 @@
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from struct import error as StructError
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, describe_error
 from flexneedle.lab.calibration.importing.columns import Table, list_names
 from flexneedle.types import Floats
 
 TIME = " time"
 """Name of the column of times; no column of a map has a leading blank and this name."""
 _MCAP, _BAG, _SQLITE = b"\x89MCAP", b"#ROSBAG", b"SQLite format 3"
+_DAMAGES = StructError, TypeError, ValueError, LookupError, MemoryError, OverflowError, EOFError
+"""Errors of the reader for a damaged file."""
 _PART = re.compile(r"([^.\[\]]+)(?:\[([^\]]*)\])?")
 
 
@@ -46,15 +49,18 @@ def read_bag(path: Path, names: Sequence[str]) -> Table:
     name of the list or the child frame of a transform. Raises InputError.
     """
     from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.rosbag1 import ReaderError as Ros1Error
+    from rosbags.rosbag2 import ReaderError as Ros2Error
+    from rosbags.typesys import Stores, TypesysError, get_typestore
 
+    refused = AnyReaderError, Ros1Error, Ros2Error, TypesysError
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
             topics = sorted({connection.topic for connection in reader.connections})
             columns = {name: _split(name, topics) for name in names}
             series = _read_series(reader, columns)
-    except AnyReaderError as error:
-        raise InputError(f"is a bag that cannot be read: {error}") from None
+    except (*refused, *_DAMAGES) as error:
+        raise InputError(f"is a damaged or unfinished bag: {describe_error(error)}") from None
     clock = series[names[0]][:, 0]
     return {TIME: clock} | {name: _newest(values, clock) for name, values in series.items()}
 

@@ -47,18 +47,20 @@ def list_names(names: Collection[str]) -> str:
     return (", ".join(shown) or "none") + more
 
 
-def to_numbers(name: str, values: Any, missing: Collection[float]) -> Floats:
-    """Return a column (r,) of numbers, NaN where one is missing. Raises InputError for text and infinity."""
+def to_numbers(name: str, values: Any, missing: Collection[float], largest: float = 1e12) -> Floats:
+    """Return a column (r,) of numbers, NaN where one is missing. Raises InputError for text and larger numbers."""
     array = np.asarray(values)
     if array.ndim != 1:
         raise InputError(f"column {name!r} must have one number in each row")
     numbers = array.astype(float) if array.dtype.kind in "fiub" else _parse(name, array.tolist(), float)
-    if np.isinf(numbers).any():
-        raise InputError(
-            f"column {name!r}, row {int(np.isinf(numbers).argmax()) + 1}: must be a finite number"
-        )
     coded = np.abs(numbers - BAD_FLOAT) < -BAD_FLOAT_TOLERANCE * BAD_FLOAT
-    return np.where(coded | np.isin(numbers, list(missing)), np.nan, numbers)
+    numbers = np.where(coded | np.isin(numbers, list(missing)), np.nan, numbers)
+    if (wrong := np.abs(numbers) > largest).any():
+        row = int(wrong.argmax())
+        raise InputError(
+            f"column {name!r}, row {row + 1}: {numbers[row]:g} must be a finite number up to {largest:g}"
+        )
+    return numbers
 
 
 def to_seconds(name: str, values: Any, factor: float) -> Floats:
@@ -74,7 +76,7 @@ def to_seconds(name: str, values: Any, factor: float) -> Floats:
         whole = array.astype("M8[ns]").astype(np.int64) * 1e-9
         return np.where(unknown, np.nan, whole)
     if array.dtype.kind in "fiub":
-        return factor * to_numbers(name, array, ())
+        return factor * to_numbers(name, array, (), largest=1e20)
     return _parse(name, array.tolist(), lambda value: _second(value, factor))
 
 

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -36,17 +36,27 @@ def _fitted(text: str) -> str:
     return text
 
 
-Column = Annotated[str, Field(min_length=1, max_length=200)]
+Column = Annotated[str, Field(min_length=1, max_length=200, json_schema_extra={"allowed": "column"})]
 """A column by its name, with a minus sign before it to invert its sign."""
-Columns = Annotated[tuple[Column, ...], Field(strict=False)]
-Times = Annotated[tuple[Column, ...], Field(strict=False, max_length=2)]
-Position = Annotated[tuple[Column, ...], Field(strict=False, min_length=2, max_length=3)]
-Angles = Annotated[tuple[Column, ...], Field(strict=False, min_length=1, max_length=2)]
-Three = Annotated[tuple[Column, Column, Column], Field(strict=False)]
-Four = Annotated[tuple[Column, Column, Column, Column], Field(strict=False)]
-Numbers = Annotated[tuple[float, ...], Field(strict=False)]
-Direction = Annotated[str, AfterValidator(_direction)]
-FrameAxis = Annotated[str, AfterValidator(_fitted)]
+
+
+def _list(shown: str, **bounds: Any) -> Any:
+    """Return the field of a list, with the values that the reference shows."""
+    return Field(strict=False, json_schema_extra={"allowed": shown}, **bounds)
+
+
+Columns = Annotated[tuple[Column, ...], _list("list of columns")]
+Times = Annotated[tuple[Column, ...], _list("1 or 2 columns", max_length=2)]
+Position = Annotated[tuple[Column, ...], _list("2 or 3 columns", min_length=2, max_length=3)]
+Angles = Annotated[tuple[Column, ...], _list("1 or 2 columns", min_length=1, max_length=2)]
+Three = Annotated[tuple[Column, Column, Column], _list("3 columns")]
+Four = Annotated[tuple[Column, Column, Column, Column], _list("4 columns")]
+Texts = Annotated[tuple[str, ...], _list("list of texts")]
+Numbers = Annotated[tuple[float, ...], _list("list of numbers")]
+Direction = Annotated[str, AfterValidator(_direction), Field(json_schema_extra={"allowed": "`x`, `-y` …"})]
+FrameAxis = Annotated[
+    str, AfterValidator(_fitted), Field(json_schema_extra={"allowed": "`x`, `-y` …, `fit`"})
+]
 LengthUnit = Literal["mm", "cm", "m", "um", "inch"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -63,7 +73,7 @@ class TableMap(Section):
     """Names of all columns of a text file without a line of names."""
     lines_after_header: int = count(0, least=0, most=1000)
     """Lines between the names of the columns and the first row, such as a line of units."""
-    where: dict[str, str] = Field(default={}, examples=[{"sensor": "tip"}])
+    where: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "table of texts"})
     """Values by column: other rows are ignored, such as rows of other sensors."""
     missing: Numbers = ()
     """Numbers that are written for a missing one, such as -999."""
@@ -102,7 +112,7 @@ class TipMap(Section):
     """Unit of the angles."""
     status: str | None = None
     """Column of the sensor's status; rows with another status than `ok` have no position."""
-    ok: Columns = ("ok",)
+    ok: Texts = ("ok",)
     """Values of the status of a measured position, in capital or small letters."""
 
     @model_validator(mode="after")
@@ -119,7 +129,7 @@ class TipMap(Section):
 
 
 class StageMap(Section):
-    """Section `guide` or `base`: the stage that moves the guide, or the base of the needle, laterally."""
+    """A stage that moves the guide or the base of the needle laterally."""
 
     y: Column | None = None
     """Column of the position along y of the needle's frame."""

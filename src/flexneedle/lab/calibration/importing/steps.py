@@ -77,7 +77,7 @@ def still_phases(time: Floats, position: Floats, stages: Floats, least_s: float)
 
 
 def _is_still(values: Floats, n: int) -> NDArray[np.bool_]:
-    """Return whether means over n rows (r, a) are those of the next n, (r − 2 n + 1,)."""
+    """Return whether means over n rows (r, a) are the same as over the next n, (r − 2 n + 1,)."""
     sums = np.cumsum(np.vstack([np.zeros(values.shape[1]), values]), axis=0)
     means = (sums[n:] - sums[:-n]) / n
     motion = np.linalg.norm(means[n:] - means[:-n], axis=1)

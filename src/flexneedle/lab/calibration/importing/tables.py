@@ -83,7 +83,7 @@ def _read_matlab(path: Path, names: Sequence[str]) -> Table:
 
     try:
         variables = loadmat(path, squeeze_me=True, simplify_cells=True)
-    except (MatReadError, NotImplementedError, ValueError, TypeError, EOFError) as error:
+    except (MatReadError, NotImplementedError, ValueError, TypeError, LookupError, EOFError) as error:
         raise InputError(f"is a damaged MATLAB file: {error}") from None
     if "__function_workspace__" in variables:
         raise InputError(
