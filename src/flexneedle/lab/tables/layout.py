@@ -47,18 +47,21 @@ def open_text(path: Path) -> TextIO:
 
 
 def find_layout(path: Path, names: Collection[str]) -> CsvLayout:
-    """Return the layout of a CSV file whose header is the first line with these names, also a comment.
+    """Return the layout of a CSV file whose header is the first line with most of these names, also a comment.
 
-    If no line has them, the layout of `read_layout`. Raises InputError if there are no column names or no row.
+    Without a name in any line, the layout of `read_layout`. Raises InputError if there are no column names or no row.
     """
-    found = read_layout(path)
+    found, most = read_layout(path), 0
     with open_text(path) as file:
         for number, line in enumerate(islice(file, _FIRST_LINES)):
             for text in dict.fromkeys((line.strip(" \n").lstrip(_MARKS), line.strip(" \n"))):
                 separator = _find_separator(text)
                 header = tuple(name.strip() for name in _split_loosely(text, separator))
-                if names and {*names} <= {*header}:
-                    return CsvLayout(header, separator, number)
+                count = len({*names} & {*header})
+                if count > most:
+                    found, most = CsvLayout(header, separator, number), count
+                if most == len({*names}):
+                    return found
     return found
 
 

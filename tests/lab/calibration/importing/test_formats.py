@@ -55,6 +55,37 @@ def test_units_after_the_header_and_names_with_units(tmp_path):
     )
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16"])
+def test_other_encodings(tmp_path, encoding):
+    table = {f"{name} [µm]": 1e3 * values for name, values in TABLE.items()}
+    file = write_csv(tmp_path / "gel.csv", table, separator=";", decimal=",")
+    file.write_bytes(file.read_text(encoding="utf-8").encode(encoding))
+    tip = {"position": ["x [µm]", "y [µm]", "z [µm]"], "unit": "um"}
+    imported = load(file, tip=tip, guide={"y": "gy [µm]", "z": "gz [µm]", "unit": "um"})
+    assert_steps(imported.session.recordings[0], PATH)
+    assert imported.suspected == ()
+
+
+def test_the_export_of_a_bag_begins_with_a_percent_sign(tmp_path):
+    table = {"%time": 10**9 * np.arange(18)} | {f"field.pose.position.{a}": TABLE[a] for a in "xyz"}
+    tip = {"position": [f"field.pose.position.{a}" for a in "xyz"]}
+    echo = load(
+        write_csv(tmp_path / "a.csv", table), tip=tip, guide=None, time={"columns": ["%time"], "unit": "ns"}
+    )
+    np.testing.assert_allclose(echo.session.recordings[0].time, np.arange(18.0))
+    np.testing.assert_allclose(echo.session.recordings[0].position, PATH.position)
+
+
+@pytest.mark.parametrize("code", ["0", "-999"])
+def test_a_code_for_a_missing_position(tmp_path, code):
+    table = {name: [*map(str, values + (100.0 if name == "x" else 0.0))] for name, values in TABLE.items()}
+    for name in "xyz":
+        table[name][5] = code
+    found = load(write_csv(tmp_path / "a.csv", table), table={"missing": [0, -999]}).session.recordings[0]
+    assert len(found.depth) == 17
+    np.testing.assert_allclose(found.guide, np.delete(PATH.guide, 5, axis=0))
+
+
 def test_a_table_without_a_header(tmp_path):
     file = tmp_path / "gel.txt"
     np.savetxt(file, np.column_stack([*TABLE.values()]))
@@ -217,6 +248,7 @@ def test_bags_of_points_and_of_transforms(tmp_path):
         ({"s": [1664971234] * 18, "n": [*range(10**6, 19 * 10**6, 10**6)]}, {"columns": ["s", "n"]}),
         ({"t": [f"2022-10-05T12:00:{k:02}.5" for k in range(18)]}, {"columns": ["t"]}),
         ({"t": [f"2022-10-05 12:00:{k:02}Z" for k in range(18)]}, {"columns": ["t"]}),
+        ({"t": [f"2022-10-05T12:00:{k:02}.123456789+02:00" for k in range(18)]}, {"columns": ["t"]}),
         ({"t": [f"12:00:{k:02}.250" for k in range(18)]}, {"columns": ["t"]}),
         ({"d": ["2022-10-05"] * 18, "t": [f"12:00:{k:02}" for k in range(18)]}, {"columns": ["d", "t"]}),
     ],

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from datetime import time
+from datetime import UTC, datetime, time
 from difflib import get_close_matches
 from typing import Any
 
@@ -35,8 +35,9 @@ def locate(names: Collection[str], found: Sequence[str]) -> dict[str, int]:
 def _refusal(name: str, count: int, found: Sequence[str]) -> InputError:
     if count:
         return InputError(f"has {count} columns {name!r}: choose one as '{name}[1]' to '{name}[{count}]'")
-    close = get_close_matches(name, found, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
+    small = {each.lower(): each for each in found}
+    close = get_close_matches(name.lower(), small, n=1)
+    hint = f"did you mean {small[close[0]]!r}? " if close else ""
     return InputError(f"has no column {name!r}; {hint}it has {list_names(found)}")
 
 
@@ -47,14 +48,14 @@ def list_names(names: Collection[str]) -> str:
     return (", ".join(shown) or "none") + more
 
 
-def to_numbers(name: str, values: Any, missing: Collection[float], largest: float = 1e12) -> Floats:
+def to_numbers(name: str, values: Any, largest: float = 1e12) -> Floats:
     """Return a column (r,) of numbers, NaN where one is missing. Raises InputError for text and larger numbers."""
     array = np.asarray(values)
     if array.ndim != 1:
         raise InputError(f"column {name!r} must have one number in each row")
     numbers = array.astype(float) if array.dtype.kind in "fiub" else _parse(name, array.tolist(), float)
     coded = np.abs(numbers - BAD_FLOAT) < -BAD_FLOAT_TOLERANCE * BAD_FLOAT
-    numbers = np.where(coded | np.isin(numbers, list(missing)), np.nan, numbers)
+    numbers = np.where(coded, np.nan, numbers)
     if (wrong := np.abs(numbers) > largest).any():
         row = int(wrong.argmax())
         raise InputError(
@@ -76,7 +77,7 @@ def to_seconds(name: str, values: Any, factor: float) -> Floats:
         whole = array.astype("M8[ns]").astype(np.int64) * 1e-9
         return np.where(unknown, np.nan, whole)
     if array.dtype.kind in "fiub":
-        return factor * to_numbers(name, array, (), largest=1e20)
+        return factor * to_numbers(name, array, largest=1e20)
     return _parse(name, array.tolist(), lambda value: _second(value, factor))
 
 
@@ -85,7 +86,8 @@ def _second(value: Any, factor: float) -> float:
         return value.hour * 3600.0 + value.minute * 60.0 + value.second + 1e-6 * value.microsecond
     text = str(value).strip()
     if "-" in text[1:] and "e" not in text.lower():
-        return float(np.datetime64(text.removesuffix("Z"), "ns").astype(np.int64)) * 1e-9
+        date = datetime.fromisoformat(text)
+        return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     if ":" in text:
         hours, minutes, seconds = (*text.split(":"), "0")[:3]
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))

@@ -76,7 +76,7 @@ class TableMap(Section):
     where: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "table of texts"})
     """Values by column: other rows are ignored, such as rows of other sensors."""
     missing: Numbers = ()
-    """Numbers that are written for a missing one, such as -999."""
+    """Numbers, such as -999 or 0: a position whose coordinates all are one of them is missing."""
 
 
 class TimeMap(Section):

@@ -125,6 +125,8 @@ def _whole(columns: Table, recording_map: RecordingMap) -> Rows:
     tip, roll = recording_map.tip, recording_map.roll
     count = len(columns[to_name(tip.position[0])])
     position = LENGTHS[tip.unit] * _vectors(columns, tip.position)
+    for code in recording_map.table.missing:
+        position[np.all([columns[to_name(name)] == code for name in tip.position], axis=0)] = np.nan
     if tip.status:
         measured = np.isin(np.char.lower(columns[tip.status]), [each.lower() for each in tip.ok])
         position[~measured] = np.nan

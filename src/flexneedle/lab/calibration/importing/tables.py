@@ -49,11 +49,11 @@ def _read(path: Path, recording_map: RecordingMap) -> Table:
 
 
 def _convert(columns: Table, recording_map: RecordingMap) -> Iterator[tuple[str, Any]]:
-    time, missing = recording_map.time, recording_map.table.missing
+    time = recording_map.time
     for name in recording_map.text:
         yield name, np.array(["" if each is None else str(each).strip() for each in columns[name].tolist()])
     for name in recording_map.numbers:
-        yield name, to_numbers(name, columns[name], missing)
+        yield name, to_numbers(name, columns[name])
     units = zip(time.columns, (time.unit, time.second_unit), strict=False)
     found = [to_seconds(to_name(name), columns[to_name(name)], TIMES[unit]) for name, unit in units]
     if found:

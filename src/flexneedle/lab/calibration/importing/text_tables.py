@@ -1,6 +1,6 @@
 """Text tables of recordings: CSV, TSV, semicolons, blanks, decimal commas, lines before the names of the columns."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -13,6 +13,7 @@ from flexneedle.lab.calibration.importing.columns import locate
 from flexneedle.lab.calibration.importing.map_file import TableMap
 from flexneedle.lab.tables.layout import (
     BLANKS,
+    COMMENT,
     CsvLayout,
     find_layout,
     has_decimal_commas,
@@ -32,14 +33,40 @@ def read_text(
     Arrow reads a file of regular lines; another one is read line by line. Raises InputError.
     """
     require_extra("study", "pyarrow")
+    data = path.read_bytes()
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        read_layout(path)  # refuses a file that is no text
+        wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        data = data.decode("utf-16" if wide else "cp1252", errors="replace").encode()
+        return _with_copy(data, lambda copy: _read_utf8(copy, data, numbers, times, text, table))
+    return _read_utf8(path, data, numbers, times, text, table)
+
+
+def _with_copy(data: bytes, read: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / "copy"
+        copy.write_bytes(data)
+        return read(copy)
+
+
+def _read_utf8(
+    path: Path,
+    data: bytes,
+    numbers: Collection[str],
+    times: Collection[str],
+    text: Collection[str],
+    table: TableMap,
+) -> dict[str, Any]:
+    """Return columns of a text table in UTF-8 with its contents; blanks between columns become semicolons."""
     names = dict.fromkeys((*numbers, *times, *text))
     layout = _layout(path, names, table)
-    if layout.separator == BLANKS and b'"' not in (data := path.read_bytes()) and b"\0" not in data:
-        with TemporaryDirectory() as folder:
-            copy = Path(folder) / path.name
-            copy.write_bytes(b"\n".join(b";".join(line.split()) for line in data.splitlines()) + b"\n")
-            return _read_separated(copy, replace(layout, separator=";"), names, times, text)
-    return _read_separated(path, layout, names, times, text)
+    if layout.separator != BLANKS or b'"' in data:
+        return _read_separated(path, layout, names, times, text)
+    plain = b"\n".join(b";".join(line.split()) for line in data.splitlines()) + b"\n"
+    separated = replace(layout, separator=";")
+    return _with_copy(plain, lambda copy: _read_separated(copy, separated, names, times, text))
 
 
 def _read_separated(
@@ -70,15 +97,19 @@ def _layout(path: Path, names: Collection[str], table: TableMap) -> CsvLayout:
 
 
 def _clocks(path: Path, layout: CsvLayout, places: dict[str, int]) -> dict[str, str]:
-    """Return which columns of times are dates or times of day, by the first row."""
+    """Return which columns of times are dates or times of day: no numbers in the first row."""
     with open_text(path) as file:
-        line = next(islice(file, layout.skipped + 1, None), "").strip()
-    fields = line.replace(chr(34), "").split(layout.separator)
-    return {
-        name: "clock"
-        for name, k in places.items()
-        if k < len(fields) and ({*":"} & {*fields[k]} or "-" in fields[k][4:5])
-    }
+        line = next(islice(file, layout.skipped + 1, None), "").strip("\n")
+    fields = dict(enumerate(line.replace('"', "").split(layout.separator)))
+    return {name: "clock" for name, k in places.items() if not _is_number(fields.get(k, ""))}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", ".") if text.strip().lower() not in EMPTY else "nan")
+    except ValueError:
+        return False
+    return True
 
 
 def _read_directly(path: Path, layout: CsvLayout, kinds: dict[int, str]) -> dict[int, Any]:
@@ -109,9 +140,13 @@ def _parse(
     rows = csv.read_csv(
         path,
         csv.ReadOptions(skip_rows=skipped, column_names=names, use_threads=False),
-        csv.ParseOptions(delimiter=separator),
+        csv.ParseOptions(delimiter=separator, invalid_row_handler=_skip_comment),
         csv.ConvertOptions(
             include_columns=list(types), column_types=types, null_values=_EMPTY, decimal_point=mark
         ),
     )
     return {k: rows[f"c{k}"].to_numpy() for k in kinds}
+
+
+def _skip_comment(row: Any) -> str:
+    return "skip" if str(row.text).startswith(COMMENT) else "error"
