@@ -127,12 +127,17 @@ class Session:
         return f"<Session {', '.join(self.names)}: {len(self.recordings)} insertions, {steps} steps>"
 
     def save(self, folder: Path) -> None:
-        """Write the folder of a session: `steps.parquet` and `session.toml`."""
+        """Write the folder of a session: `steps.parquet` and `session.toml`. Raises InputError if it cannot be created."""
         require_extra("study", "pyarrow")
         from pyarrow import table
         from pyarrow.parquet import write_table
 
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: cannot be created: {error.strerror}: choose another folder"
+            ) from None
         steps = BytesIO()
         write_table(table(to_columns(self.recordings)), steps)
         replace_file(folder / STEPS_FILE, steps.getvalue())

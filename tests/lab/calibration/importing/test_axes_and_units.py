@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flexneedle.lab.calibration.importing.map_file import ANGLES, LENGTHS
 from recorded_insertions import assert_steps, columns, guided, load, write_csv
 
 PATH = guided()
+LENGTHS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4}
+ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "mrad": 0.001}
 SIGNED = ["x", "y", "z", "-x", "-y", "-z"]
 FRAMES = [pair for pair in itertools.permutations(SIGNED, 2) if pair[0][-1] != pair[1][-1]]
 AXES = dict(zip(SIGNED, np.vstack([np.eye(3), -np.eye(3)]), strict=True))

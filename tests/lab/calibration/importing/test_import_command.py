@@ -40,6 +40,16 @@ def test_import_prints_what_it_understood_and_writes_a_session(tmp_path, capsys)
     assert imread(out / "session.png").shape[1] == 1800
 
 
+def test_a_file_is_no_folder_of_a_session(tmp_path, capsys):
+    file = write_csv(tmp_path / "a.csv", columns(guided()))
+    (tmp_path / "lab.toml").write_text(tomli_w.dumps(PLAIN))
+    status, shown, notes = run_import(
+        capsys, str(file), "--map", str(tmp_path / "lab.toml"), "--out", str(file)
+    )
+    assert (status, shown) == (2, "")
+    assert notes == f"flexneedle: {file}: cannot be created: File exists: choose another folder\n"
+
+
 def test_the_picture_has_a_panel_for_each_axis_and_a_colour_for_each_session(tmp_path):
     files = [write_csv(tmp_path / f"gel{k}" / "a.csv", columns(guided(seed=k))) for k in range(9)]
     for plane in (False, True):

@@ -5,6 +5,7 @@ import pytest
 
 from recorded_insertions import PLAIN, columns, guided, load, write_csv
 
+MIRRORED = {"position": ["x", "-y", "z"], "axis": ["ax", "-ay", "az"]}
 TIP, GUIDE = PLAIN["tip"], PLAIN["guide"]
 
 
@@ -29,7 +30,7 @@ def test_a_good_map_raises_no_suspicion(files):
         ({"guide": GUIDE | {"y": "-gy"}}, "turns towards the guide's motion along y"),
         ({"guide": GUIDE | {"z": "-gz"}}, "turns towards the guide's motion along z"),
         ({"guide": {"y": "gz", "z": "gy"}}, "exchange guide.y and guide.z"),
-        ({"tip": {"position": ["x", "-y", "z"]}}, "turns towards the guide's motion along y"),
+        ({"tip": MIRRORED}, "turns towards the guide's motion along y"),
         ({"tip": TIP | {"axis": ["ax", "-ay", "az"]}}, "turn to opposite sides along y"),
         ({"time": {"columns": ["t"], "unit": "ms"}}, "the tip advances at 500 mm/s (median): check time.unit"),
         ({"roll": {"column": "roll"}, "time": {"columns": ["t"], "unit": "us"}}, "check time.unit"),

@@ -21,6 +21,7 @@ from flexneedle.types import Floats
 _STILL_MM = 0.2  # motion of the guide that does not bend a path
 _STRAIGHT_MM = 15.0  # least advance from which a direction is estimated
 _LEAST_MOVES = 6
+_NEAR_MM, _FAR_MM = 3.0, 60.0  # depths between which the guide turns the tip
 _ALONG = 0.3  # sine of the least angle between y and x
 _CERTAIN = 4.0  # standard errors of a response
 
@@ -105,7 +106,7 @@ def with_fitted_y(frame: Frame, recordings: Sequence[Recording], source: str) ->
     response = guide_response(recordings)
     if response is None or not response.certain.any():
         raise InputError(
-            f'{source}: frame.y = "fit" needs {_LEAST_MOVES} motions of the guide that turn the tip: '
+            f'{source}: frame.y = "fit" needs {_LEAST_MOVES} motions of the guide that turn the measured needle: '
             "name the axis of the tracker"
         )
     left, _, right = np.linalg.svd(-response.matrix)
@@ -129,7 +130,7 @@ class Response:
 
 
 def guide_response(recordings: Sequence[Recording]) -> Response | None:
-    """Return the response of the tip's direction to the guide in tissue; None with too few motions."""
+    """Return the response of the measured slope to the guide in tissue; None with too few motions."""
     pairs = [pair for one in recordings for pair in _turns(one)]
     if len(pairs) < _LEAST_MOVES:
         return None
@@ -144,26 +145,10 @@ def guide_response(recordings: Sequence[Recording]) -> Response | None:
     return Response((found[:size] * moved[:, None]).T, np.where(moved[:, None], errors, np.inf).T)
 
 
-_NEAR, _FAR = 3.0, 60.0  # depths (mm) between which the guide turns the tip
-_ADVANCE = 0.5  # mm between readings of a direction
-
-
 def _turns(one: Recording) -> Iterator[tuple[Floats, Floats]]:
-    """Yield motions of the guide and the turns of the tip that follow, (a,) each.
-
-    The tip's direction is the sensor's slope, or without one the path's before and after the interval of the motion.
-    """
-    moves = np.diff(one.guide, axis=0)
-    advance = np.diff(one.depth)
-    measured = np.isfinite(one.slope).all()
-    going = np.flatnonzero(advance > _ADVANCE)
-    heading = np.diff(one.position, axis=0) / np.maximum(advance, _ADVANCE)[:, None]
-    for k in np.flatnonzero(np.linalg.norm(moves, axis=1) > _STILL_MM):
-        if not _NEAR < one.depth[k] < _FAR:
-            continue
-        if measured:
-            yield moves[k], one.slope[k + 1] - one.slope[k]
-            continue
-        before, after = going[going < k], going[going > k]
-        if len(before) and len(after):
-            yield moves[k], heading[after[0]] - heading[before[-1]]
+    """Yield motions of the guide and turns of the tip in the same intervals, (a,) each, in tissue."""
+    moves, turns = np.diff(one.guide, axis=0), np.diff(one.slope, axis=0)
+    inside = (one.depth[:-1] > _NEAR_MM) & (one.depth[:-1] < _FAR_MM)
+    moved = np.linalg.norm(moves, axis=1) > _STILL_MM
+    known = np.isfinite(turns).all(axis=1)
+    yield from zip(moves[inside & moved & known], turns[inside & moved & known], strict=True)
