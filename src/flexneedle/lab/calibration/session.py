@@ -127,7 +127,7 @@ class Session:
         return f"<Session {', '.join(self.names)}: {len(self.recordings)} insertions, {steps} steps>"
 
     def save(self, folder: Path) -> None:
-        """Write the folder of a session: `steps.parquet` and `session.toml`. Raises InputError if it cannot be created."""
+        """Write `steps.parquet` and `session.toml` into a folder. Raises InputError if it cannot be created."""
         require_extra("study", "pyarrow")
         from pyarrow import table
         from pyarrow.parquet import write_table
