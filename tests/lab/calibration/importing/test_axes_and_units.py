@@ -102,9 +102,12 @@ def test_a_plane_of_a_tracker_in_space(tmp_path):
 def test_registration_and_a_guide_in_the_axes_of_the_tracker(tmp_path):
     turn = Rotation.from_euler("zyx", [0.4, -1.1, 2.0])
     shift = np.array([120.0, -40.0, 15.0])
-    points = turn.inv().apply(PATH.points + np.array([7.0, 1.0, 2.0]) - shift)
-    guide = turn.inv().apply(np.column_stack([np.full(18, -20.0), PATH.guide]) - shift)
-    axis = turn.inv().apply(PATH.axis)
+    stage = np.array(
+        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    )  # rows: x, y, z of the needle's frame
+    points = turn.inv().apply((PATH.points + np.array([7.0, 1.0, 2.0])) @ stage - shift)
+    guide = turn.inv().apply(np.column_stack([np.full(18, -20.0), PATH.guide]) @ stage - shift)
+    axis = turn.inv().apply(PATH.axis @ stage)
     table = dict(zip("xyzabcuvw", np.hstack([points, guide, axis]).T, strict=True))
     registration = {
         "rotation": turn.as_quat(scalar_first=True).tolist(),
@@ -115,7 +118,7 @@ def test_registration_and_a_guide_in_the_axes_of_the_tracker(tmp_path):
         write_csv(tmp_path / "a.csv", table),
         tip={"position": ["x", "y", "z"], "axis": ["u", "v", "w"]},
         guide={"position": ["a", "b", "c"]},
-        frame={"registration": registration, "skin_mm": 5.0},
+        frame={"x": "-y", "y": "x", "registration": registration, "skin_mm": 5.0},
     ).session.recordings
     np.testing.assert_allclose(found.depth, PATH.depth + 2.0, atol=1e-9)
     np.testing.assert_allclose(found.position, PATH.position, atol=1e-9)
