@@ -9,6 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
 
 from flexneedle.errors import InputError
+from flexneedle.lab.calibration.importing.columns import to_seconds
 from recorded_insertions import PLAIN, assert_steps, columns, guided, load, write_csv
 
 PATH = guided()
@@ -259,3 +260,8 @@ def test_times(tmp_path, times, section):
     (found,) = load(write_csv(tmp_path / "a.csv", table), time=section).session.recordings
     step = 1e-3 if "s" in times else 1.0
     np.testing.assert_allclose(np.diff(found.time), step, atol=1e-6)
+
+
+def test_a_time_of_day_in_seconds():
+    times = to_seconds("t", np.array(["01:02:03.5", "", "01:02:03,5"], dtype=object), 1.0)
+    np.testing.assert_allclose(times, [3723.5, np.nan, 3723.5])
