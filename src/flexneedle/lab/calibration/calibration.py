@@ -93,7 +93,7 @@ class Calibration:
 
     def _priors(self) -> Iterator[tuple[str, float]]:
         """Yield the priors of the controller: interval, and variation from insertion to insertion."""
-        gain = float(self.fitted.noise.sd[5])
+        gain = float(self.fitted.noise.sd[6])
         found = {each.name: each for each in self.parameters if each.label not in self.unidentified}
         if "stiffness" in found:
             sd = self._sd(found["stiffness"])

@@ -29,15 +29,18 @@ from scipy.optimize import minimize
 
 from flexneedle.types import Floats
 
-KINDS = ("heading", "lateral", "response", "shift", "curvature", "gain", "position", "slope")
+KINDS = ("heading", "lateral", "turn", "response", "shift", "curvature", "gain", "position", "slope")
 """Kinds of errors, in the order of their standard deviations."""
-_UNITS = ("rad/√mm", "mm/√mm", "1", "mm", "1/mm", "1", "mm", "rad")
-_INTERVALS = 4  # kinds with a factor for each interval
-_FIRST = np.array([8e-4, 0.03, 0.3, 8.0, 2e-5, 0.1, 0.03, 3e-4])
+_UNITS = ("rad/√mm", "mm/√mm", "1", "1", "mm", "1/mm", "1", "mm", "rad")
+GAIN_KINDS = (5, 6)
+"""Kinds of errors that an insertion has as a whole."""
+_INTERVALS = 5  # kinds with a factor for each interval
+_FIRST = np.array([8e-4, 0.03, 0.2, 0.3, 8.0, 2e-5, 0.1, 0.03, 3e-4])
 _BOUNDS = np.array(
     [
         (1e-5, 0.1),
         (1e-4, 1.0),
+        (1e-3, 3.0),
         (1e-3, 3.0),
         (1e-2, 100.0),
         (1e-6, 1e-3),
@@ -61,6 +64,12 @@ class Noise:
     def first() -> "Noise":
         """Return the values at the start of an estimation."""
         return Noise(_FIRST)
+
+    def without(self, kinds: Sequence[int]) -> "Noise":
+        """Return the same without some kinds of errors."""
+        sd = self.sd.copy()
+        sd[[*kinds]] = 0.0
+        return Noise(sd)
 
     def __str__(self) -> str:
         pairs = zip(KINDS, self.sd, _UNITS, strict=True)
@@ -102,18 +111,25 @@ class Deviations:
             ]
         )
 
+    @cached_property
+    def blocks(self) -> Floats:
+        """Covariances (5, 2, 2, k) of the disturbances of each interval by `KINDS`, for standard deviations of 1."""
+        size, (u, v), dx = len(self.depth), self.predicted, self.advance
+        blocks = np.zeros((_INTERVALS, 2, 2, size))
+        blocks[0] = [[dx**3 / 3.0, dx**2 / 2.0], [dx**2 / 2.0, dx]]
+        blocks[1, 0, 0] = dx
+        blocks[2] = [[(v * dx) ** 2, v * v * dx], [v * v * dx, v * v]]
+        blocks[3] = [[u * u, u * v], [u * v, v * v]]
+        blocks[4, 0, 0] = v * v
+        return blocks
+
     def unit_covariances(self, factors: Floats) -> Floats:
         """Return covariances (8, 2 k, 2 k) of e and ξ by `KINDS`, for standard deviations of 1; the last two are noise.
 
         factors (k,): on the variances of each interval.
         """
-        size, (u, v), dx = len(self.depth), self.predicted, self.advance
-        blocks = np.zeros((_INTERVALS, 2, 2, size))
-        blocks[0] = [[dx**3 / 3.0, dx**2 / 2.0], [dx**2 / 2.0, dx]]
-        blocks[1, 0, 0] = dx
-        blocks[2] = [[u * u, u * v], [u * v, v * v]]
-        blocks[3, 0, 0] = v * v
-        blocks *= factors
+        size, (u, v) = len(self.depth), self.predicted
+        blocks = self.blocks * factors
         x = self.depth - self.depth[0]
         whole = np.stack([np.append(0.5 * x * x, x), self.effect @ np.append(u, v)])
         parts = [self._spread(block) for block in blocks]
@@ -169,14 +185,7 @@ class Whitened:
     def with_factors_for(self, noise: Noise, residuals: Floats) -> "Whitened":
         """Return the same with the expected factors of the intervals, given the residuals (r,)."""
         deviations, size = self.deviations, len(self.deviations.depth)
-        u, v = deviations.predicted
-        dx, sd = deviations.advance[1:], noise.sd
-        unit = np.zeros((size - 1, 2, 2))
-        unit[:, 0, 0] = (
-            sd[0] ** 2 * dx**3 / 3.0 + sd[1] ** 2 * dx + (sd[2] * u[1:]) ** 2 + (sd[3] * v[1:]) ** 2
-        )
-        unit[:, 1, 1] = sd[0] ** 2 * dx + (sd[2] * v[1:]) ** 2
-        unit[:, 0, 1] = unit[:, 1, 0] = sd[0] ** 2 * dx**2 / 2.0 + sd[2] ** 2 * u[1:] * v[1:]
+        unit = np.einsum("b,bijk->kij", noise.sd[:_INTERVALS] ** 2, deviations.blocks[..., 1:])
         solved = cho_factor(self.covariance(noise), lower=True)
         weighed = cho_solve(solved, residuals)
         effect = deviations.effect[self.known].reshape(-1, 2, size)[:, :, 1:]

@@ -1,13 +1,13 @@
-"""The fit: penalized least squares of whitened residuals, alternating with the noise and the weights of intervals."""
+"""The fit: robust least squares of the errors of predictions ahead, alternating with the noise they follow from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
+from flexneedle.lab.calibration.ahead import HORIZONS, Rows, predict_ahead
 from flexneedle.lab.calibration.deviations import Deviations, Noise, Whitened, estimate_noise
 from flexneedle.lab.calibration.parameters import Parameter, make_needle, trial_of
 from flexneedle.lab.calibration.prediction import Replay
@@ -16,6 +16,7 @@ from flexneedle.types import Floats
 
 _ROUNDS = 10  # of parameters, noise and weights
 _SETTLED = 0.1  # change of a parameter, in standard deviations, at which the rounds end
+_LEAST_SD = 0.01  # mm; of the errors of predictions
 _AXIS_SD = 0.05  # rad; prior standard deviation of the sensor's axis about the needle's
 
 
@@ -132,11 +133,56 @@ def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """The end of a fit: point, noise, and the whitened residuals there.
+class Predictions:
+    """Predictions of all recordings: `Rows` for each recording and axis, standard deviations (h,) of the errors (mm) by
+    horizon, and the weight of an error.
+    """
 
-    cost: −2 ln of the likelihood, with the prior; whitened (m,) with derivatives (m, p + s); groups (m,): recording of
-    each; rounds: until it settled, or all.
+    rows: list[Rows]
+    sd: Floats
+    weight: float
+
+    @staticmethod
+    def of(problem: Problem, paths: Sequence[Whitened], noise: Noise, found: Residuals) -> "Predictions":
+        """Return the predictions, with the root mean squares of their errors at the residuals.
+
+        Errors of overlapping predictions are not independent: each counts by the share of its advance that is its own.
+        """
+        depths = [one.depth for one in problem.replay.recordings]
+        reached = max(float(np.ptp(depth)) for depth in depths)
+        spacing = float(np.mean(np.concatenate([np.diff(depth) for depth in depths])))
+        rows = [predict_ahead(path, noise, reached) for path in paths]
+        errors = np.concatenate([each.rows @ values for each, values in zip(rows, found.values, strict=True)])
+        horizon = np.concatenate([each.horizon for each in rows])
+        sd = np.ones(len(HORIZONS))
+        for k in np.unique(horizon):
+            sd[k] = max(float(np.sqrt(np.mean(errors[horizon == k] ** 2))), _LEAST_SD)
+        overlap = float(np.exp(np.mean(np.log(HORIZONS)))) * reached / spacing
+        return Predictions(rows, sd, 1.0 / (len(HORIZONS) * max(overlap, 1.0)))
+
+    def scale(self, found: Residuals) -> tuple[Floats, Floats, Floats]:
+        """Return errors (m,) over their standard deviations, derivatives (m, p + s), and the recording (m,) of each."""
+        parts = [
+            (each.rows @ value / self.sd[each.horizon], each.rows @ slope / self.sd[each.horizon, None])
+            for each, value, slope in zip(self.rows, found.values, found.slopes, strict=True)
+        ]
+        axes = len(self.rows) // len(found.tips)
+        groups = np.repeat(np.arange(len(self.rows)) // axes, [len(each.rows) for each in self.rows])
+        return np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts]), groups
+
+    def loss(self, errors: Floats) -> float:
+        """Return −2 ln of the likelihood of scaled errors (m,): twice the pseudo-Huber loss, and of their scales."""
+        horizon = np.concatenate([each.horizon for each in self.rows])
+        each = 2.0 * (np.sqrt(1.0 + errors**2) - 1.0) + 2.0 * np.log(self.sd[horizon])
+        return self.weight * float(each.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The end of a fit: point, noise, and the errors of predictions there.
+
+    cost: −2 ln of the likelihood, with the prior; errors (m,), scaled and weighted, with derivatives (m, p + s); groups
+    (m,): recording of each; settled: whether the rounds ended before the last.
     """
 
     problem: Problem
@@ -144,7 +190,7 @@ class Fitted:
     noise: Noise
     paths: list[Whitened]
     cost: float
-    whitened: Floats
+    errors: Floats
     slopes: Floats
     groups: Floats
     tips: Floats
@@ -158,22 +204,8 @@ class Fitted:
         return found
 
 
-def whiten(paths: Sequence[Whitened], noise: Noise, found: Residuals) -> tuple[Floats, Floats, Floats, float]:
-    """Return whitened residuals (m,), derivatives (m, p + s), recordings (m,) and ln |covariance|."""
-    values, slopes, total = [], [], 0.0
-    for path, value, slope in zip(paths, found.values, found.slopes, strict=True):
-        root = np.linalg.cholesky(path.covariance(noise))
-        both = solve_triangular(root, np.column_stack([value, slope]), lower=True, check_finite=False)
-        values.append(both[:, 0])
-        slopes.append(both[:, 1:])
-        total += 2.0 * float(np.log(np.diag(root)).sum())
-    per_recording = len(paths) // max(1, len(found.tips))
-    groups = np.repeat(np.arange(len(paths)) // per_recording, [len(each) for each in values])
-    return np.concatenate(values), np.concatenate(slopes), groups, total
-
-
 def fit(problem: Problem, start: Floats | None = None, noise: Noise | None = None) -> Fitted:
-    """Return the maximum a posteriori of the parameters, from a start (default: the prior's mean)."""
+    """Return the parameters of the least errors of predictions, with their prior, from a start (default: the prior)."""
     point = problem.start if start is None else start
     noise, settled = noise or Noise.first(), False
     found = residuals_at(problem, point)
@@ -181,31 +213,33 @@ def fit(problem: Problem, start: Floats | None = None, noise: Noise | None = Non
     found = residuals_at(problem, point)
     paths = paths_at(problem, found.tips)
     for _ in range(_ROUNDS):
-        before, information = point, None
-        point, found = _least_squares(problem, paths, noise, point)
+        before = point
+        predictions = Predictions.of(problem, paths, noise, found)
+        point, found = _least_squares(problem, predictions, point)
         paths = _renew(problem, paths, found)
-        left = list(found.values)
-        noise = estimate_noise(paths, left, noise)
-        paths = [path.with_factors_for(noise, value) for path, value in zip(paths, left, strict=True)]
-        _, slopes, _, _ = whiten(paths, noise, found)
-        information = slopes.T @ slopes + np.diag(problem.sd**-2.0)
-        scale = np.sqrt(np.diag(np.linalg.inv(information)))
-        settled = bool((np.abs(point - before) < _SETTLED * scale).all())
-        if settled:
-            break
-    return conclude(problem, paths, noise, point, found, settled)
+        noise = estimate_noise(paths, found.values, noise)
+        paths = [path.with_factors_for(noise, value) for path, value in zip(paths, found.values, strict=True)]
+        ended = conclude(problem, paths, noise, point, found, settled)
+        scale = np.sqrt(np.diag(np.linalg.inv(ended.information)))
+        if (np.abs(point - before) < _SETTLED * scale).all():
+            return replace(ended, settled=True)
+    return ended
 
 
 def conclude(
     problem: Problem, paths: list[Whitened], noise: Noise, point: Floats, found: Residuals, settled: bool
 ) -> Fitted:
-    """Return the fit at a point with its residuals."""
-    whitened, slopes, groups, logs = whiten(paths, noise, found)
+    """Return the fit at a point with its errors."""
+    predictions = Predictions.of(problem, paths, noise, found)
+    errors, slopes, groups = predictions.scale(found)
     off = (point - problem.start) / problem.sd
-    cost = float(whitened @ whitened + logs + off @ off)
+    # Weights of iterated least squares for the pseudo-Huber loss.
+    root = np.sqrt(predictions.weight) * (1.0 + errors**2) ** -0.25
+    cost = predictions.loss(errors) + float(off @ off)
     return Fitted(
-        problem, point, noise, paths, cost, whitened, slopes, groups, found.tips, settled, found.converged
-    )
+        problem, point, noise, paths, cost, root * errors, root[:, None] * slopes, groups, found.tips, settled,
+        found.converged,
+    )  # fmt: skip
 
 
 def _renew(problem: Problem, paths: Sequence[Whitened], found: Residuals) -> list[Whitened]:
@@ -214,11 +248,10 @@ def _renew(problem: Problem, paths: Sequence[Whitened], found: Residuals) -> lis
     return [replace(path, factors=old.factors) for path, old in zip(new, paths, strict=True)]
 
 
-def _least_squares(
-    problem: Problem, paths: Sequence[Whitened], noise: Noise, start: Floats
-) -> tuple[Floats, Residuals]:
-    """Return the point of least squares for a given noise, and its residuals."""
+def _least_squares(problem: Problem, predictions: Predictions, start: Floats) -> tuple[Floats, Residuals]:
+    """Return the point of the least loss for given predictions, and its residuals."""
     known: dict[bytes, Residuals] = {}
+    root = np.sqrt(predictions.weight)
 
     def at(point: Floats) -> Residuals:
         key = point.tobytes()
@@ -227,14 +260,26 @@ def _least_squares(
         return known[key]
 
     def misfit(point: Floats) -> Floats:
-        return np.append(whiten(paths, noise, at(point))[0], (problem.start - point) / problem.sd)
+        return np.append(root * predictions.scale(at(point))[0], (problem.start - point) / problem.sd)
 
     def derivative(point: Floats) -> Floats:
-        return -np.vstack([whiten(paths, noise, at(point))[1], np.diag(1.0 / problem.sd)])
+        return -np.vstack([root * predictions.scale(at(point))[1], np.diag(1.0 / problem.sd)])
+
+    def loss(squares: Floats) -> Floats:
+        """Return the loss, and its derivatives, of squared weighted errors: pseudo-Huber, and squares of the prior."""
+        rho = np.stack([squares, np.ones_like(squares), np.zeros_like(squares)])
+        data = slice(None, -len(start))
+        z = 1.0 + squares[data] / predictions.weight
+        rho[:, data] = [
+            2.0 * predictions.weight * (z**0.5 - 1.0),
+            z**-0.5,
+            -0.5 / predictions.weight * z**-1.5,
+        ]
+        return rho
 
     low, high = problem.bounds
     inside = np.clip(start, low + 1e-9, high - 1e-9)
     found = least_squares(
-        misfit, inside, derivative, bounds=(low, high), x_scale="jac", xtol=1e-4, ftol=1e-6, max_nfev=12
+        misfit, inside, derivative, bounds=(low, high), loss=loss, x_scale="jac", xtol=1e-4, ftol=1e-6, max_nfev=12
     )
     return found.x, at(found.x)

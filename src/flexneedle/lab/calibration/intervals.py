@@ -36,12 +36,12 @@ def jackknife(fitted: Fitted) -> Floats:
     point, prior = fitted.point, fitted.problem.sd**-2.0
     pull = prior * (fitted.problem.start - point)
     groups, information = np.unique(fitted.groups), fitted.information
-    gradient = fitted.slopes.T @ fitted.whitened + pull
+    gradient = fitted.slopes.T @ fitted.errors + pull
     moved = []
     for one in groups:
         rows = fitted.groups == one
         less = information - fitted.slopes[rows].T @ fitted.slopes[rows]
-        moved.append(np.linalg.solve(less, gradient - fitted.slopes[rows].T @ fitted.whitened[rows]))
+        moved.append(np.linalg.solve(less, gradient - fitted.slopes[rows].T @ fitted.errors[rows]))
     off = np.array(moved) - np.mean(moved, axis=0)
     count = len(groups)
     covariance: Floats = (count - 1.0) / count * off.T @ off
