@@ -19,7 +19,7 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Floats
 
 NAMES = ("stiffness", "bevel", "guide", "clearance", "yield", "drift")
-_FIRST_YIELD_MM = 0.4
+_FIRST_YIELD = 0.2  # of the outer diameter of the needle
 
 
 @dataclass(frozen=True)
@@ -108,10 +108,10 @@ def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
 
 
 def _yield(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
-    first = math.log(_yield_of(scenario) or _FIRST_YIELD_MM)
+    first = math.log(_yield_of(scenario) or _FIRST_YIELD * scenario.needle.outer_diameter)
     low, high = math.log(0.02), math.log(min(layer.compression_length_mm for layer in scenario.tissue) * 0.69)
     yield Parameter(
-        "yield", "displacement that tears", min(first, high), 0.5, low, high, 0.05, math.log(2.0), True, "mm"
+        "yield", "displacement that tears", min(first, high), 0.7, low, high, 0.05, math.log(2.0), True, "mm"
     )
 
 
