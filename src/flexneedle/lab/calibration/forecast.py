@@ -33,7 +33,7 @@ def forecast(fitted: Fitted) -> list[Forecast]:
             _on_axis(paths[axes * n + axis], fitted.noise, found.values[axes * n + axis])
             for axis in range(axes)
         ]
-        model = found.tips[n, :count, 1 : 1 + axes]
+        model = np.stack([found.models[axes * n + axis][:count] for axis in range(axes)], axis=1)
         mean = np.stack([expected for expected, _ in both], axis=2) + model
         forecasts.append(Forecast(mean, np.stack([sd for _, sd in both], axis=2)))
     return forecasts
