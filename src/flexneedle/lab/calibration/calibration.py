@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,8 @@ _OTHER_STARTS = {"stiffness": (np.log(10.0), -np.log(10.0)), "yield": (np.log(0.
 """Further starts of a fit, as changes of a coordinate."""
 _SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
 _READINGS = 0.5  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
+_FIRST_ROUNDS = 2  # until the noise says which criterion to use
+_PROFILED = 1.5  # half-widths of the interval, to either side
 _MOVED = 1e-3  # of the prior's standard deviation
 _ADVICE = {
     "stiffness": "move the guide by ±{guide:g} mm at depths of {depths} mm",
@@ -33,6 +36,14 @@ _ADVICE = {
     "yield": "move the guide by ±{guide:g} and ±{more:g} mm at depths of {depths} mm",
     "drift": "repeat the first insertion at the end of the session",
 }
+
+
+class Profile(NamedTuple):
+    """A profile likelihood: values (k,) of a parameter, and the rise (k,) of the loss with all others fitted again."""
+
+    parameter: Parameter
+    values: Floats
+    rise: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,16 +148,18 @@ class Calibration:
                 yield f"two minima fit alike: {label} = {here:.4g} or {there:.4g}"
                 break
 
-    def profile(self, label: str, count: int = 9) -> tuple[Floats, Floats]:
-        """Return values (count,) of a parameter, and the rise of −2 ln of the likelihood with it at each."""
-        labels = [each.label for each in self.parameters]
-        if label not in labels:
-            raise InputError(f"parameter = {label}: must be one of {', '.join(labels)}")
-        k = labels.index(label)
-        interval, parameter = self.intervals[label], self.parameters[k]
-        width = 1.5 * (interval.high - interval.value)
+    def profile(self, name: str, count: int = 9) -> Profile:
+        """Return the profile of a parameter, by its name or its label. Raises InputError for another."""
+        chosen = [k for k, each in enumerate(self.parameters) if name in (each.name, each.label)]
+        if len(chosen) != 1:
+            raise InputError(f"profile = {name}: must be one of {', '.join(each.label for each in self.parameters)}")
+        k = chosen[0]
+        parameter = self.parameters[k]
+        interval = self.intervals[parameter.label]
+        width = _PROFILED * (interval.high - interval.value)
         at = np.clip(interval.value + width * np.linspace(-1.0, 1.0, count), parameter.low, parameter.high)
-        return np.array([parameter.value(each) for each in at.tolist()]), profile(self.fitted, k, at.tolist())
+        values = np.array([parameter.value(each) for each in at.tolist()])
+        return Profile(parameter, values, profile(self.fitted, k, at.tolist()))
 
     def table(self) -> list[tuple[str, str, str]]:
         """Return rows of a table: parameter, value, interval of 95 %."""
@@ -191,9 +204,9 @@ def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
 
     By the likelihood if predictions have more error from the readings than from what the model lacks; else by their errors.
     """
-    chosen = fit(problem, Likelihood)
-    if reading_share(chosen) < _READINGS:
-        chosen = fit(problem, PredictionErrors)
+    first = fit(problem, Likelihood, rounds=_FIRST_ROUNDS)
+    criterion = Likelihood if reading_share(first) > _READINGS else PredictionErrors
+    chosen = fit(problem, criterion, first.point if criterion is Likelihood else None, first.noise)
     again = (fit(problem, chosen.criterion, start, chosen.noise) for start in _other_starts(problem))
     best, *others = sorted([chosen, *again], key=lambda each: each.cost)
     return best, tuple(others)

@@ -172,7 +172,11 @@ class Fitted:
 
 
 def fit(
-    problem: Problem, criterion: type[Criterion], start: Floats | None = None, noise: Noise | None = None
+    problem: Problem,
+    criterion: type[Criterion],
+    start: Floats | None = None,
+    noise: Noise | None = None,
+    rounds: int = _ROUNDS,
 ) -> Fitted:
     """Return the parameters with the least loss, and their noise, from a start (default: the prior's mean)."""
     point = problem.start if start is None else start
@@ -181,7 +185,7 @@ def fit(
     problem = replace(problem, replay=problem.replay.corrected(found.tips))
     found = residuals_at(problem, point)
     paths = paths_at(problem, found.tips)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         before = point
         point, found = _least_squares(problem, criterion.of(paths, noise, found.values), point)
         new = paths_at(problem, found.tips)

@@ -112,7 +112,7 @@ def _yield(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
     first = math.log(_yield_of(scenario) or _FIRST_YIELD * scenario.needle.outer_diameter)
     low, high = math.log(0.02), math.log(min(layer.compression_length_mm for layer in scenario.tissue) * 0.69)
     yield Parameter(
-        "yield", "displacement that tears", min(first, high), 0.7, low, high, 0.05, math.log(4.0), True, "mm"
+        "yield", "displacement that tears", min(first, high), 0.7, low, high, 0.05, math.log(3.0), True, "mm"
     )
 
 

@@ -40,15 +40,15 @@ class Replay:
         return self.recordings[0].axes
 
     @cached_property
-    def begins(self) -> Floats:
-        """Depth (n,) at which each insertion starts in the model, in air."""
-        return np.array([min(0.0, depth[0]) - _AIR_MM for depth in self.depths])
+    def begin(self) -> float:
+        """Depth at which all insertions start in the model, in air."""
+        return min(0.0, *(float(depth[0]) for depth in self.depths)) - _AIR_MM
 
     @cached_property
     def _parts(self) -> int:
         """Parts of the advance between two steps, for all intervals."""
         longest = max((abs(np.diff(depth)).max(initial=0.0) for depth in self.depths), default=0.0)
-        first = max(depth[0] - begin for depth, begin in zip(self.depths, self.begins, strict=True))
+        first = max(float(depth[0]) for depth in self.depths) - self.begin
         return max(1, int(np.ceil(max(longest, first) / _LONGEST_MM - 1e-9)))
 
     @cached_property
@@ -57,9 +57,9 @@ class Replay:
         steps, width = max(len(depth) for depth in self.depths), self._parts + 2
         rows = np.zeros((len(self.recordings), steps, width, 9))
         at = {"before": slice(0, 1), "with": slice(1, -1), "after": slice(-1, None)}[self.guide_order]
-        for row, one, depth, begin in zip(rows, self.recordings, self.depths, self.begins, strict=True):
+        for row, one, depth in zip(rows, self.recordings, self.depths, strict=True):
             size = len(depth)
-            row[:size, 1:-1, DB_X] = np.diff(depth, prepend=begin)[:, None] / self._parts
+            row[:size, 1:-1, DB_X] = np.diff(depth, prepend=self.begin)[:, None] / self._parts
             for column, moved in ((DG_Y, one.guide), (DB_Y, one.base)):
                 change = np.diff(moved, axis=0, prepend=moved[:1])
                 for axis in range(self.axes):
@@ -77,11 +77,10 @@ class Replay:
         Those of recordings with fewer than k steps repeat their last.
         """
         states, models = [], []
+        zero = (0.0,) * self.axes
         for needle in needles:
-            for begin, order in zip(self.begins.tolist(), self.order, strict=True):
-                zero = (0.0,) * self.axes
-                states.append(needle.simulator.start(needle.roll, (begin, *zero), zero))
-                models.append(needle.model(order))
+            states += [needle.simulator.start(needle.roll, (self.begin, *zero), zero)] * len(self.order)
+            models += [needle.model(order) for order in self.order]
         rows = np.tile(self.commands, (len(needles), 1, 1))
         out = needles[0].simulator.rollout(states, rows, models=models, limits=False)
         shape = len(needles), len(self.recordings), len(self._ends)

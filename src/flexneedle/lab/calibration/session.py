@@ -121,7 +121,9 @@ class Session:
         return self.select([place % 2 == 1 for place in self.order])
 
     def of(self, name: str) -> "Session":
-        """Return one of the sessions."""
+        """Return one of the sessions. Raises InputError for another name."""
+        if name not in self.names:
+            raise InputError(f"session = {name}: must be one of {', '.join(self.names)}")
         return self.select([one.session == name for one in self.recordings])
 
     def select(self, chosen: Sequence[bool]) -> "Session":

@@ -1,4 +1,4 @@
-"""`flexneedle calibrate` and `validate`: from recorded insertions to a scenario, and how well it predicts."""
+"""`flexneedle calibrate`: a scenario fitted to the insertions of a session."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from flexneedle.cli.common import print_json, print_table
 from flexneedle.cli.progress import print_note
 
 
-def add_calibrate(commands: Commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add `calibrate` to the parser of `flexneedle`."""
     parser = add_command(
         commands,
         "calibrate",
         "fit a scenario to recorded insertions",
         _calibrate,
-        "flexneedle calibrate session mine.toml --fit stiffness bevel guide --out calibrated.toml",
-        about="Fit a scenario to the insertions of a session. Exit status 1: the fit is not to be trusted, and why.",
+        "flexneedle calibrate session gel --out calibrated.toml",
+        "flexneedle calibrate session mine.toml --fit stiffness bevel guide clearance yield --profile stiffness",
+        about="Fit a scenario to the insertions of a session. Exit status 1: the fit is not to be trusted, for the "
+        "reasons that are printed.",
     )
-    parser.add_argument("session", metavar="SESSION", type=expand_home, help="folder of the session")
+    parser.add_argument("session", metavar="SESSION", type=expand_home, help="folder of flexneedle import")
     parser.add_argument("scenario", metavar="SCENARIO", help="scenario from which the fit starts")
     parser.add_argument(
         "--fit",
@@ -29,6 +31,10 @@ def add_calibrate(commands: Commands) -> None:
         metavar="NAME",
         default=["stiffness", "bevel", "guide"],
         help="parameters: stiffness, bevel, guide, clearance, yield, drift (default: the first three)",
+    )
+    parser.add_argument("--session", metavar="NAME", dest="name", help="one of the sessions in the folder (default: all)")
+    parser.add_argument(
+        "--profile", metavar="NAME", help="draw the profile likelihood of a parameter, beside the scenario"
     )
     parser.add_argument(
         "--out",
@@ -45,14 +51,19 @@ def _calibrate(args: argparse.Namespace) -> int:
     from flexneedle.lab.calibration.files import read_record, write_calibration
     from flexneedle.lab.calibration.session import load_session
 
-    found = calibrate(args.scenario, load_session(args.session), args.fit)
+    session = load_session(args.session)
+    found = calibrate(args.scenario, session if args.name is None else session.of(args.name), args.fit)
     write_calibration(found, args.out, str(args.scenario))
     if args.json:
         print_json(read_record(args.out) or {})
     else:
         print_table("", ("parameter", "value", "95 %"), found.table())
-        print(f"Errors: {found.fitted.noise}")
+        print(f"Errors of the model and of readings: {found.final.noise}")
         print(f"\nScenario: {args.out}")
+    if args.profile is not None:
+        from flexneedle.lab.calibration.picture import save_profile
+
+        print(f"Profile: {save_profile(found, args.profile, args.out)}")
     for problem in found.problems:
         print_note(problem)
     return 1 if found.problems else 0
