@@ -1,7 +1,7 @@
 """Calibration: a scenario fitted to recorded insertions, with intervals, and what the data do not say."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -152,7 +152,9 @@ class Calibration:
         """Return the profile of a parameter, by its name or its label. Raises InputError for another."""
         chosen = [k for k, each in enumerate(self.parameters) if name in (each.name, each.label)]
         if len(chosen) != 1:
-            raise InputError(f"profile = {name}: must be one of {', '.join(each.label for each in self.parameters)}")
+            raise InputError(
+                f"profile = {name}: must be one of {', '.join(each.label for each in self.parameters)}"
+            )
         k = chosen[0]
         parameter = self.parameters[k]
         interval = self.intervals[parameter.label]

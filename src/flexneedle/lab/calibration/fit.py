@@ -200,7 +200,12 @@ def fit(
 
 
 def conclude(
-    problem: Problem, criterion: type[Criterion], paths: list[Whitened], noise: Noise, point: Floats, found: Residuals
+    problem: Problem,
+    criterion: type[Criterion],
+    paths: list[Whitened],
+    noise: Noise,
+    point: Floats,
+    found: Residuals,
 ) -> Fitted:
     """Return the fit at a point, not settled."""
     given = criterion.of(paths, noise, found.values)
@@ -250,7 +255,15 @@ def _least_squares(problem: Problem, criterion: Criterion, start: Floats) -> tup
     low, high = problem.bounds
     inside = np.clip(start, low + 1e-9, high - 1e-9)
     found = least_squares(
-        misfit, inside, derivative, bounds=(low, high), loss=rho, x_scale="jac", xtol=1e-4, ftol=1e-6, max_nfev=12
+        misfit,
+        inside,
+        derivative,
+        bounds=(low, high),
+        loss=rho,
+        x_scale="jac",
+        xtol=1e-4,
+        ftol=1e-6,
+        max_nfev=12,
     )
     return found.x, at(found.x)
 
@@ -264,6 +277,7 @@ def reading_share(fitted: Fitted) -> float:
         rows, _ = predict_ahead(path, fitted.noise, reached)
         start = path.start
         parts += [
-            np.einsum("ai,ij,aj->", rows, path.covariance(noise) - start, rows) for noise in (readings, fitted.noise)
+            np.einsum("ai,ij,aj->", rows, path.covariance(noise) - start, rows)
+            for noise in (readings, fitted.noise)
         ]
     return float(parts[0] / parts[1])

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from flexneedle.lab.calibration.deviations import TAIL, Noise, Whitened
-from flexneedle.lab.calibration.fit import Fitted, residuals_at, paths_at
+from flexneedle.lab.calibration.fit import Fitted, paths_at, residuals_at
 from flexneedle.types import Floats
 
 

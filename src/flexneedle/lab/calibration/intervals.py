@@ -87,7 +87,9 @@ def fixed(fitted: Fitted, k: int, value: float, **limits: int) -> Fitted:
     parameters = (*problem.parameters[:k], tight, *problem.parameters[k + 1 :])
     start = fitted.point.copy()
     start[k] = value
-    return fit(Problem(problem.scenario, parameters, problem.replay), fitted.criterion, start, fitted.noise, **limits)
+    return fit(
+        Problem(problem.scenario, parameters, problem.replay), fitted.criterion, start, fitted.noise, **limits
+    )
 
 
 def profile(fitted: Fitted, k: int, values: Sequence[float]) -> Floats:

@@ -96,9 +96,7 @@ def _guide(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
         raise InputError("fit = guide: the scenario has no guide (setup.guide_to_skin_mm)")
     first = math.log(scenario.setup.guide_to_skin_mm)
     low = max(first - 1.0, math.log(scenario.setup.tip_to_skin_mm) + 1e-3)  # the tip starts before the guide
-    yield Parameter(
-        "guide", "guide to skin", first, 0.1, low, first + 1.0, 0.02, math.log(1.25), True, "mm"
-    )
+    yield Parameter("guide", "guide to skin", first, 0.1, low, first + 1.0, 0.02, math.log(1.25), True, "mm")
 
 
 def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:

@@ -32,7 +32,9 @@ def add_parser(commands: Commands) -> None:
         default=["stiffness", "bevel", "guide"],
         help="parameters: stiffness, bevel, guide, clearance, yield, drift (default: the first three)",
     )
-    parser.add_argument("--session", metavar="NAME", dest="name", help="one of the sessions in the folder (default: all)")
+    parser.add_argument(
+        "--session", metavar="NAME", dest="name", help="one of the sessions in the folder (default: all)"
+    )
     parser.add_argument(
         "--profile", metavar="NAME", help="draw the profile likelihood of a parameter, beside the scenario"
     )
