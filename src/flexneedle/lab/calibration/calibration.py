@@ -1,7 +1,7 @@
 """Calibration: a scenario fitted to recorded insertions, with intervals, and what the data do not say."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -201,4 +201,4 @@ def _starts(problem: Problem) -> Iterator[Floats]:
 
 def split(session: Session) -> tuple[Session, Session]:
     """Return the halves of a session for training and test: every other insertion of each session."""
-    return session.even, replace(session, recordings=session.odd.recordings)
+    return session.even, session.odd
