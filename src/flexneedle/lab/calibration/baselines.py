@@ -93,8 +93,9 @@ def _mean_path(training: Sequence[Recording]) -> Predictor:
     def predict(one: Recording, i: Indices, j: Indices) -> Floats:
         moved = np.array([_at(each, one.depth[j]) - _at(each, one.depth[i]) for each in training])
         known = np.isfinite(moved)
-        total: Floats = np.where(known, moved, 0.0).sum(axis=0)
-        return total / np.maximum(known.sum(axis=0), 1)
+        total = np.where(known, moved, 0.0).sum(axis=0)
+        mean: Floats = total / np.maximum(known.sum(axis=0), 1)
+        return mean
 
     return predict
 

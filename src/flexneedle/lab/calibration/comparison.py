@@ -119,14 +119,15 @@ def fit_nuisances(scenario: Scenario, training: Session, drift: float) -> Fitted
 
 
 def _fit_direction(problem: Problem, axes: int) -> Floats:
-    """Return the point whose bevel, its first numbers (axes,), has the direction that fits, and the scenario's offset."""
+    """Return the point whose bevel, its first numbers (axes,), has the direction that fits and the known offset."""
     point = problem.start
     for _ in range(_STEPS if axes else 0):
         found = residuals_at(problem, point)
         ended = conclude(problem, paths_at(problem, found.tips), Noise.first(), point, found, settled=False)
         pull = (problem.start - point) / problem.sd**2
         point = point + np.linalg.solve(ended.information, ended.slopes.T @ ended.errors + pull)
-    bevel = point[:axes] * (problem.scenario.needle.bevel.offset_mm / max(np.linalg.norm(point[:axes]), 1e-9))
+    size = max(float(np.linalg.norm(point[:axes])), 1e-9)
+    bevel = point[:axes] * (problem.scenario.needle.bevel.offset_mm / size)
     return np.append(bevel, point[axes:])
 
 

@@ -144,7 +144,8 @@ class Deviations:
         """Return the covariance (2 k, 2 k) at all steps of disturbances with covariances (2, 2, k)."""
         left = self.effect.reshape(-1, 2, len(self.depth))
         weighed = np.einsum("pik,ijk->pjk", left, block)
-        return weighed.reshape(len(left), -1) @ left.reshape(len(left), -1).T
+        found: Floats = weighed.reshape(len(left), -1) @ left.reshape(len(left), -1).T
+        return found
 
     @cached_property
     def start(self) -> Floats:
@@ -196,7 +197,9 @@ class Whitened:
         effect = deviations.effect.reshape(len(self.known), 2, -1)[self.known, :, 1:]
         solved = cho_factor(self.covariance(noise), lower=True)
         pull = np.tensordot(cho_solve(solved, residuals), effect, 1)
-        root = solve_triangular(solved[0], effect.reshape(len(residuals), -1), lower=True).reshape(effect.shape)
+        root = solve_triangular(solved[0], effect.reshape(len(residuals), -1), lower=True).reshape(
+            effect.shape
+        )
         excess = np.einsum("pik,pjk->ijk", root, root) - pull[:, None] * pull
         # The expected squared distance of a disturbance from 0, of 2 in the mean.
         distance = factors * (2.0 - factors * np.einsum("ijk,ijk->k", excess, unit))

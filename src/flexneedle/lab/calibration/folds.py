@@ -55,10 +55,14 @@ def split(given: Calibration | Scenario | str | Path, session: Session, training
         return _single(source, training, session, "given")
     fitted = source.training or _those(session, source.used)
     if not fitted.recordings:
-        return _halves(replace(source, again=None), session, "The scenario was not fitted to these insertions")
+        return _halves(
+            replace(source, again=None), session, "The scenario was not fitted to these insertions"
+        )
     if all(key in source.used for key in _keys(session)) and source.again is not None:
         count = len(session.recordings)
-        return _halves(source, session, f"All {count} insertions were used in the fit: it was repeated on each half")
+        return _halves(
+            source, session, f"All {count} insertions were used in the fit: it was repeated on each half"
+        )
     return _single(source, fitted, session, "of the fit")
 
 
@@ -67,10 +71,16 @@ def _source_of(given: Calibration | Scenario | str | Path) -> _Source:
         names = tuple(dict.fromkeys(each.name for each in given.parameters))
         used = frozenset(_keys(given.session))
         return _Source(
-            given.scenario, given.trial.drift, used, given.session, lambda part: calibrate(given.start, part, names)
+            given.scenario,
+            given.trial.drift,
+            used,
+            given.session,
+            lambda part: calibrate(given.start, part, names),
         )
     scenario = load_scenario(given)
-    record = None if isinstance(given, Scenario) or Path(given).suffix != ".toml" else read_record(Path(given))
+    record = (
+        None if isinstance(given, Scenario) or Path(given).suffix != ".toml" else read_record(Path(given))
+    )
     return _Source(scenario) if record is None else _recorded(scenario, record)
 
 
@@ -110,13 +120,17 @@ def _halves(source: _Source, session: Session, why: str) -> Split:
     for training, test in (halves, halves[::-1]):
         fitted = source if source.again is None else _source_of(source.again(training))
         folds.append(Fold(fitted.scenario, training, test, fitted.drift))
-    return Split(tuple(folds), f"{why}; each half, even and odd insertions of each session, predicts the other")
+    return Split(
+        tuple(folds), f"{why}; each half, even and odd insertions of each session, predicts the other"
+    )
 
 
 def _check(training: Session, test: Session) -> None:
     if not training.recordings or not test.recordings:
         lacking = "test" if training.recordings else "train"
-        raise InputError(f"session: no insertion is left to {lacking}: validation needs at least two in a session")
+        raise InputError(
+            f"session: no insertion is left to {lacking}: validation needs at least two in a session"
+        )
     if training.axes != test.axes:
         raise InputError(f"training: has {training.axes} lateral axes, the session {test.axes}")
 

@@ -36,9 +36,7 @@ def forecast(fitted: Fitted, session: Session) -> list[Forecast]:
     paths, axes = paths_at(problem, found.tips), session.axes
     forecasts = []
     for n, one in enumerate(session.recordings):
-        both = [
-            _on_axis(paths[k], fitted.noise, found.values[k]) for k in range(axes * n, axes * n + axes)
-        ]
+        both = [expect_deviations(paths[k], fitted.noise, found.values[k]) for k in range(axes * n, axes * n + axes)]
         expected, sd = np.moveaxis(np.array(both), 0, -1)
         tips = found.tips[n, : len(one.depth)]
         model = np.column_stack([tips[:, 1 : 1 + axes], tips[:, 3 : 3 + axes]])
@@ -46,7 +44,7 @@ def forecast(fitted: Fitted, session: Session) -> list[Forecast]:
     return forecasts
 
 
-def _on_axis(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, Floats]:
+def expect_deviations(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, Floats]:
     """Return expected deviations (k, k) of the position on an axis, and standard deviations, after each step."""
     count = len(path.deviations.depth)
     step, factors = np.arange(count), np.full(count, _UNKNOWN)
@@ -54,7 +52,7 @@ def _on_axis(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, F
     values = np.zeros(2 * count)
     values[path.known] = residuals
     for i in range(count):
-        now = replace(path, known=path.known & (np.tile(step, 2) <= i), factors=factors)
+        now = replace(path, known=np.logical_and(path.known, np.tile(step, 2) <= i), factors=factors)
         expected[i], variance = _predict(now, noise, values[now.known])
         sd[i] = np.sqrt(np.maximum(variance, 0.0) + noise.sd[-2] ** 2)
         if i > 0 and now.known.any():

@@ -27,7 +27,7 @@ from flexneedle.lab.calibration.verdicts import (
 from flexneedle.scenario.model import Scenario
 
 if TYPE_CHECKING:
-    from flexneedle.figures.style import StyledFigure
+    from matplotlib.figure import Figure
 
 AHEAD = (5.0, 10.0, 20.0, 40.0)
 """Distances of predictions, in mm."""
@@ -74,7 +74,9 @@ class Validation:
         found = []
         for ahead, errors in self.errors.items():
             guided = bool(errors.guided.any())
-            found.append(judge(GUIDED, ahead, errors.select(errors.guided)) if guided else judge("all", ahead, errors))
+            found.append(
+                judge(GUIDED, ahead, errors.select(errors.guided)) if guided else judge("all", ahead, errors)
+            )
         return (*found, judge(END, 0.0, self.ends)) if len(self.ends) else tuple(found)
 
     @property
@@ -83,7 +85,7 @@ class Validation:
         whole = [row for row in self.rows if row.group == "all"]
         return headline(self.verdicts), *map(str, self.verdicts), judge_coverage(whole)
 
-    def plot(self) -> "StyledFigure":
+    def plot(self) -> "Figure":
         """Return the figure of errors, coverage, and predicted beside measured paths."""
         from flexneedle.lab.calibration.validation_report.figures import draw_overview
 
@@ -105,6 +107,7 @@ class Validation:
             "ahead_mm": list(self.ahead),
             "split": self.sentence,
             "verdict": list(self.verdict),
+            "comparisons": [each.values() for each in self.verdicts],
             "rows": [row.values() for row in self.rows],
         }
 
@@ -126,7 +129,7 @@ def validate(
         given: Calibration, or calibrated scenario, as for `load_scenario`.
         session: Recorded insertions.
         ahead: Distances (mm) of predictions.
-        training: Insertions that train; those of `session` that are not among them test.
+        training: Insertions that train; the others of `session` test.
 
     Raises:
         InputError: No insertion is left to train or to test, or no two steps are as far apart as `ahead`.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.lab.calibration.baselines import REGRESSION
 from flexneedle.lab.calibration.comparison import MODEL, Errors, Flags
@@ -12,16 +13,44 @@ from flexneedle.types import Floats
 
 _SHALLOW, _DEEP = 0.2, 0.45  # limits of groups by depth, as shares of the deepest step
 _ROUND_MM = 5.0
+NAMES = {
+    MODEL: "model",
+    "straight": "straight along the axis",
+    "stays": "tip stays",
+    "circle": "circle from the slope",
+    "circle, no slope": "circle without slope",
+    "mean path": "mean path",
+    REGRESSION: "regression on guide motion",
+}
+"""Predictors by name, in words."""
+PREDICTORS = tuple(NAMES)
+_JOINED = {
+    "better": "better than",
+    "worse": "worse than",
+    "not separable": "not separable from",
+    "too few insertions": "with too few insertions to compare with",
+}
+_HEAD = {
+    "better": "wins",
+    "worse": "loses",
+    "not separable": "neither wins nor loses",
+    "too few insertions": "has too few insertions to tell",
+}
+_AHEAD = " mm ahead, "
+_LEAST_MM = 1e-9
 _DRAWS, _LEAST = 300, 3  # of insertions in a bootstrap; insertions that it needs
 _COVERED = 0.90, 0.98
 """Coverage of intervals of 95 % that counts as right."""
 GUIDED = "guided"
-END = "to the end, guide at rest"
+END = "to the end with the guide at rest"
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Errors (mm) of a group of predictions: number, medians and 95 % by predictor, coverage of the model's intervals."""
+    """Errors (mm) of a group of predictions: number, median and 95 % by predictor, coverage of the model's intervals.
+
+    ahead: 0 for the end of insertions.
+    """
 
     group: str
     ahead: float
@@ -33,7 +62,14 @@ class Row:
     @property
     def best(self) -> str:
         """The simple predictor with the smallest median that does not know the guide's motion ahead."""
-        return min((name for name in self.median if name not in (MODEL, REGRESSION)), key=self.median.__getitem__)
+        return min(
+            (name for name in self.median if name not in (MODEL, REGRESSION)), key=self.median.__getitem__
+        )
+
+    @property
+    def main(self) -> bool:
+        """Whether the row is of all, of guided predictions, or of the end."""
+        return self.group in ("all", END) or self.group.startswith(GUIDED)
 
     def values(self) -> dict[str, Any]:
         """Return the row as plain values."""
@@ -42,7 +78,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The model's median error beside that of a simple predictor (mm), with an interval of 95 % of their ratio."""
+    """Median errors (mm) of the model and of a simple predictor, with an interval of 95 % of their ratio."""
 
     against: str
     ours: float
@@ -52,13 +88,19 @@ class Comparison:
 
     @property
     def word(self) -> str:
-        """Return better, worse or "not separable"."""
+        """Return better, worse, "not separable" or "too few insertions"."""
+        if self.high == np.inf:
+            return "too few insertions"
         return "better" if self.high < 1.0 else "worse" if self.low > 1.0 else "not separable"
 
+    @property
+    def ratio(self) -> str:
+        """The ratio of the medians with its interval as text."""
+        value = f"ratio {self.ours / max(self.theirs, _LEAST_MM):.2f}"
+        return value if self.high == np.inf else f"{value}, 95 %: {self.low:.2f} to {self.high:.2f}"
+
     def __str__(self) -> str:
-        joined = {"better": "better than", "worse": "worse than", "not separable": "not separable from"}[self.word]
-        interval = f", 95 %: {self.low:.2f} to {self.high:.2f}" if np.isfinite(self.high) else ", too few insertions"
-        return f"{joined} {self.against} ({self.theirs:.2f} mm, ratio {self.ours / max(self.theirs, 1e-9):.2f}{interval})"
+        return f"{_JOINED[self.word]} {NAMES[self.against]} ({self.theirs:.2f} mm, {self.ratio})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +114,17 @@ class Verdict:
     @property
     def where(self) -> str:
         """Distance and group in words."""
-        return self.row.group if self.row.ahead == 0.0 else f"{self.row.ahead:g} mm ahead, {self.row.group}"
+        return self.row.group if self.row.ahead == 0.0 else f"{self.row.ahead:g}{_AHEAD}{self.row.group}"
+
+    def values(self) -> dict[str, Any]:
+        """Return the verdict as plain values; the interval of a ratio is null with too few insertions."""
+        pairs = {
+            "simple": self.simple,
+            "regression": self.regression,
+        }
+        return {"predictions": self.where} | {
+            key: vars(one) | {"word": one.word} for key, one in pairs.items()
+        }
 
     def __str__(self) -> str:
         return f"{self.where}: median {self.row.median[MODEL]:.2f} mm, {self.simple}; {self.regression}"
@@ -136,7 +188,7 @@ def _compare(row: Row, errors: Errors, against: str) -> Comparison:
     return Comparison(against, row.median[MODEL], row.median[against], low, high)
 
 
-def _interval(insertion: Floats, ours: Floats, theirs: Floats) -> tuple[float, float]:
+def _interval(insertion: NDArray[np.intp], ours: Floats, theirs: Floats) -> tuple[float, float]:
     """Return the ends of the interval of the ratio of medians, by bootstrap over insertions."""
     rows = [np.flatnonzero(insertion == one) for one in np.unique(insertion)]
     if len(rows) < _LEAST:
@@ -144,19 +196,15 @@ def _interval(insertion: Floats, ours: Floats, theirs: Floats) -> tuple[float, f
     random, ratios = np.random.default_rng(0), []
     for _ in range(_DRAWS):
         drawn = np.concatenate([rows[k] for k in random.integers(len(rows), size=len(rows))])
-        ratios.append(np.median(ours[drawn]) / max(np.median(theirs[drawn]), 1e-9))
+        ratios.append(np.median(ours[drawn]) / max(np.median(theirs[drawn]), _LEAST_MM))
     low, high = np.quantile(ratios, (0.025, 0.975)).tolist()
     return low, high
 
 
 def headline(verdicts: Sequence[Verdict]) -> str:
-    """Return where the model wins against predictors that do not know the guide's motion ahead, and where it does not."""
-    by_word = {
-        word: [each.where for each in verdicts if each.simple.word == word]
-        for word in ("better", "not separable", "worse")
-    }
-    words = {"better": "wins", "not separable": "neither wins nor loses", "worse": "loses"}
-    parts = [f"{words[word]} {_list(places)}" for word, places in by_word.items() if places]
+    """Return in words where the model wins against predictors that do not know the guide's motion ahead."""
+    places = {word: [each.where for each in verdicts if each.simple.word == word] for word in _HEAD}
+    parts = [f"{_HEAD[word]} {_list(where)}" for word, where in places.items() if where]
     return f"Against predictors that do not know the guide's motion, the model {'; it '.join(parts)}."
 
 
@@ -164,10 +212,11 @@ def _list(places: Sequence[str]) -> str:
     """Return places in words, distances in a common group joined."""
     groups: dict[str, list[str]] = {}
     for place in places:
-        distance, _, group = place.partition(" mm ahead, ")
+        distance, _, group = place.partition(_AHEAD)
         groups.setdefault(group, []).append(distance)
-    return ", ".join(
-        f"{_join(distances)} mm ahead ({group})" if group else _join(distances) for group, distances in groups.items()
+    return " and ".join(
+        f"{_join(distances)}{_AHEAD}{group}" if group else _join(distances)
+        for group, distances in groups.items()
     )
 
 
@@ -178,6 +227,10 @@ def _join(words: Sequence[str]) -> str:
 def judge_coverage(rows: Sequence[Row]) -> str:
     """Return in words whether the intervals cover 95 %."""
     low, high = min(row.coverage for row in rows), max(row.coverage for row in rows)
-    shares = f"{100 * low:.0f} %" if round(100 * low) == round(100 * high) else f"{100 * low:.0f} to {100 * high:.0f} %"
+    shares = (
+        f"{100 * low:.0f} %"
+        if round(100 * low) == round(100 * high)
+        else f"{100 * low:.0f} to {100 * high:.0f} %"
+    )
     word = "too narrow" if low < _COVERED[0] else "wider than needed" if high > _COVERED[1] else "right"
     return f"The model's intervals of 95 % cover {shares} of the readings: {word}."
