@@ -55,14 +55,11 @@ def split(given: Calibration | Scenario | str | Path, session: Session, training
         return _single(source, training, session, "given")
     fitted = source.training or _those(session, source.used)
     if not fitted.recordings:
-        return _halves(
-            replace(source, again=None), session, "The scenario was not fitted to these insertions"
-        )
-    if all(key in source.used for key in _keys(session)) and source.again is not None:
-        count = len(session.recordings)
-        return _halves(
-            source, session, f"All {count} insertions were used in the fit: it was repeated on each half"
-        )
+        why = "The scenario was not fitted to these insertions: each half trains the rest of the model for the other"
+        return _halves(replace(source, again=None), session, why)
+    if source.again is not None and all(key in source.used for key in _keys(session)):
+        why = f"All {len(session.recordings)} insertions were used in the fit: the fit was repeated on each half"
+        return _halves(source, session, f"{why}, and each half predicts the other")
     return _single(source, fitted, session, "of the fit")
 
 
@@ -87,7 +84,7 @@ def _source_of(given: Calibration | Scenario | str | Path) -> _Source:
 def _recorded(scenario: Scenario, record: dict[str, Any]) -> _Source:
     """Return the source of a scenario with a record of its fit. Raises InputError for a record without a key."""
     try:
-        start, names = Scenario.from_values(record["start"]), tuple(record["fit"])
+        start, names = Scenario.from_values(record["start"], "record of the calibration"), tuple(record["fit"])
         used = frozenset((str(session), str(name)) for session, name in record["insertions"])
         fitted = [each for label, each in record["parameters"].items() if label.startswith("drift")]
         drift = sum(each["value"] for each in fitted if each["identified"])
@@ -120,9 +117,7 @@ def _halves(source: _Source, session: Session, why: str) -> Split:
     for training, test in (halves, halves[::-1]):
         fitted = source if source.again is None else _source_of(source.again(training))
         folds.append(Fold(fitted.scenario, training, test, fitted.drift))
-    return Split(
-        tuple(folds), f"{why}; each half, even and odd insertions of each session, predicts the other"
-    )
+    return Split(tuple(folds), f"{why} (even and odd insertions of each session)")
 
 
 def _check(training: Session, test: Session) -> None:
