@@ -148,7 +148,7 @@ def test_each_session_is_trained_by_its_own_insertions_else_by_all():
     parts = list(sessions_of(fold))
     assert [part.test.names for part in parts] == [("a",), ("c",)]
     assert [keys(part.training) for part in parts] == [{("a", "a0"), ("a", "a2")}, {("c", "c0")}]
-    alone = list(sessions_of(Fold(GEL, every.of("a"), every.of("b"))))[0]
+    alone = next(sessions_of(Fold(GEL, every.of("a"), every.of("b"))))
     assert alone.training.names == ("b",)
     assert [one.name for one in alone.training.recordings] == ["a0", "a1", "a2", "a3"]
 

@@ -99,8 +99,13 @@ class Comparison:
         value = f"ratio {self.ours / max(self.theirs, _LEAST_MM):.2f}"
         return value if self.high == np.inf else f"{value}, 95 %: {self.low:.2f} to {self.high:.2f}"
 
+    @property
+    def joined(self) -> str:
+        """The word with its preposition."""
+        return _JOINED[self.word]
+
     def __str__(self) -> str:
-        return f"{_JOINED[self.word]} {NAMES[self.against]} ({self.theirs:.2f} mm, {self.ratio})"
+        return f"{self.joined} {NAMES[self.against]} ({self.theirs:.2f} mm, {self.ratio})"
 
 
 @dataclass(frozen=True, eq=False)
