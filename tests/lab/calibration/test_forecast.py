@@ -76,6 +76,15 @@ def test_without_disturbances_the_first_reading_is_continued_straight():
     np.testing.assert_allclose(sd[0], np.sqrt(2.0 * 0.01**2 + (1e-4 * DEPTH) ** 2), rtol=1e-3)
 
 
+def test_after_exact_readings_the_next_step_has_the_variance_of_its_disturbance():
+    """A random walk of the heading by q per √mm moves the next step by q² dx³/3, twice as much in the mean of its tail."""
+    exact = Noise(np.append([1e-3], np.full(8, 1e-7)))
+    residuals = np.zeros(2 * COUNT)
+    _, sd = expect_deviations(whole(model_path()), exact, residuals)
+    ahead = sd[np.arange(COUNT - 1), np.arange(1, COUNT)]
+    np.testing.assert_allclose(ahead, np.sqrt(2.0 * 1e-6 * 5.0**3 / 3.0), rtol=1e-3)
+
+
 def test_mirrored_readings_have_the_mirrored_forecast():
     deviations = model_path()
     residuals = draw(deviations, PLAIN, np.random.default_rng(4))

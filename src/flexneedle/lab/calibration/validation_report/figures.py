@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
+from matplotlib.ticker import FixedLocator, NullLocator
 
-from flexneedle.figures.layout import Look, legend_of, look, mosaic, short
-from flexneedle.figures.style import ESTIMATE, INK, NEEDLE, QUIET, TRUE, apply_style, new_figure
+from flexneedle.figures.layout import Look, fit, legend_of, look, mosaic, short
+from flexneedle.figures.style import ESTIMATE, INK, NEEDLE, QUIET, TRUE, apply_style, is_column, new_figure
 from flexneedle.lab.calibration.baselines import REGRESSION
 from flexneedle.lab.calibration.comparison import MODEL, WIDTH, Errors, Tested
 from flexneedle.lab.calibration.validation_report.response import responses
@@ -22,7 +22,8 @@ _FAINT = "#c9cbd0"
 _RIGHT = 90.0, 98.0  # %, of a coverage
 _BINS = 6
 _SHARES = 0.1, 0.5  # depths from which paths are predicted, of the deepest
-_RANKS = {0.25: "smaller error than 75 %", 0.5: "median error", 0.9: "larger error than 90 %"}
+_RANKS = {0.25: "small error", 0.5: "median error", 0.9: "large error"}
+_DECADES = 200.0  # range of errors up to which the axis has marks between decades
 
 
 def draw_overview(found: "Validation") -> Figure:
@@ -79,7 +80,9 @@ def _draw_errors(ax: Axes, shown: dict[float, Errors]) -> None:
                 zorder=4,
             )
     ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    low, high = ax.get_ylim()
+    parts = (1.0, 2.0, 5.0) if high < _DECADES * low else (1.0,)
+    ax.yaxis.set_major_locator(FixedLocator([part * 10.0**k for k in range(-6, 4) for part in parts]))
     ax.yaxis.set_minor_locator(NullLocator())
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.grid(axis="y", color=_FAINT, linewidth=0.4)
@@ -158,12 +161,13 @@ def draw_paths(found: "Validation") -> Figure:
             for axis in range(axes):
                 _draw_path(column[axis], tested, axis, (found.deepest, found.ahead[-1]))
             _draw_guide(column[-1], tested)
-            column[0].set_title("\n".join(short(line, 36) for line in title.split("\n")))
+            column[0].set_title("\n".join(short(line, fit(36)) for line in title.split("\n")))
             column[-1].set_xlabel("depth (mm)")
         for axis in range(axes):
             panels[axis, 0].set_ylabel(f"tip along {'yz'[axis]} (mm)")
         panels[-1, 0].set_ylabel("guide (mm)")
-        figure.suptitle("Predicted and measured paths", x=0.01, ha="left", fontsize=11, weight="bold")
+        size = 8 if is_column() else 11
+        figure.suptitle("Predicted and measured paths", x=0.01, ha="left", fontsize=size, weight="bold")
         legend_of(figure, [panels[0, 0], panels[-1, 0]])
     return figure
 
@@ -221,11 +225,9 @@ def draw_response(found: "Validation") -> Figure | None:
         ax.vlines(
             depth, recorded[:, 1], recorded[:, 2], color=INK, linewidth=1.4, label="95 % over insertions"
         )
-        ax.plot(depth, recorded[:, 0], "o", color=INK, markersize=5, label="recorded")
+        ax.plot(depth, recorded[:, 0], "o", color=INK, markersize=4, label="recorded", zorder=3)
         model = [1e3 * each.model for each in shown]
-        ax.plot(
-            depth, model, color=ESTIMATE, marker=look(0).marker, markersize=4, label="model, same motions"
-        )
+        ax.plot(depth, model, color=ESTIMATE, label="model, same motions", zorder=2)
         ax.set_xlim(0.0, found.deepest)
         ax.set_xlabel("depth (mm)")
         ax.set_ylabel("response (mrad/mm)")
