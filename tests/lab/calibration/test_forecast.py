@@ -30,6 +30,12 @@ def whole(deviations):
     return Whitened(deviations, np.ones(2 * COUNT, dtype=bool), np.ones(COUNT))
 
 
+def test_the_covariance_is_the_sum_over_kinds_of_errors():
+    path = Whitened(model_path(), np.arange(2 * COUNT) % 3 > 0, np.linspace(0.5, 2.0, COUNT))
+    expected = path.start + np.tensordot(PLAIN.sd**2, path.parts, 1)
+    np.testing.assert_allclose(path.covariance(PLAIN), expected, rtol=1e-9, atol=1e-12)
+
+
 def test_intervals_cover_95_percent_at_each_distance():
     random, inside = np.random.default_rng(1), []
     for n in range(250):
@@ -77,7 +83,7 @@ def test_without_disturbances_the_first_reading_is_continued_straight():
 
 
 def test_after_exact_readings_the_next_step_has_the_variance_of_its_disturbance():
-    """A random walk of the heading by q per √mm moves the next step by q² dx³/3, twice as much in the mean of its tail."""
+    """A random walk of the heading, q per √mm, moves the next step by q² dx³/3; its heavy tail doubles that."""
     exact = Noise(np.append([1e-3], np.full(8, 1e-7)))
     residuals = np.zeros(2 * COUNT)
     _, sd = expect_deviations(whole(model_path()), exact, residuals)

@@ -11,6 +11,7 @@ import tomli_w
 from commands import names
 from flexneedle.cli.main import _report_errors
 from flexneedle.errors import InputError
+from flexneedle.lab.calibration.calibration import calibrate
 from flexneedle.lab.calibration.comparison import (
     MODEL,
     Errors,
@@ -19,6 +20,7 @@ from flexneedle.lab.calibration.comparison import (
     guide_motion,
     predict_fold,
 )
+from flexneedle.lab.calibration.files import write_calibration
 from flexneedle.lab.calibration.folds import Fold
 from flexneedle.lab.calibration.prediction import fitting_scenario
 from flexneedle.lab.calibration.session import Session
@@ -168,6 +170,17 @@ def test_all_insertions_are_tested_once_by_others(session, found):
         keys(session)
     )
     assert [one.place for one in found.tested] == [k / 7 for k in (1, 3, 5, 7, 0, 2, 4, 6)]
+
+
+def test_a_calibration_and_its_file_have_the_same_validation(session, tmp_path):
+    fitted = calibrate(GEL.with_values({"needle.bevel.offset_mm": 0.3}), session.even, ("bevel",))
+    write_calibration(fitted, tmp_path / "a.toml", "gel")
+    whole, written = (validate(given, session, AHEAD) for given in (fitted, tmp_path / "a.toml"))
+    assert whole.sentence == written.sentence == "4 insertions of the fit train, 4 others test"
+    assert {one.recording.name for one in whole.tested} == {"a1", "a3", "a5", "a7"}
+    assert whole.verdicts[1].simple.word == "better"
+    for name in PREDICTORS:
+        np.testing.assert_allclose(whole.errors[20.0].size[name], written.errors[20.0].size[name], atol=0.02)
 
 
 def test_insertions_to_other_depths_are_predicted():

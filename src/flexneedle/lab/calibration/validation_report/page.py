@@ -25,7 +25,10 @@ _ERRORS = (
     "model's intervals of 95 %, where 90 to 98 % is right, and errors by depth and by order within the session, of the "
     "model, the best simple predictor and the regression."
 )
-_PATHS = "Insertions in which the model's error is smaller than in 75 % of all, median, and larger than in 90 %. Each prediction has the readings up to its circle, and the motions of the guide after it."
+_PATHS = (
+    "Insertions in which the model's error is smaller than in 75 % of all, median, and larger than in 90 %. Each "
+    "prediction has the readings up to its circle, and the motions of the guide after it."
+)
 _RESPONSE = (
     "Turn of the tip from a step to the next for a motion of the guide by 1 mm, by regression: recorded, and in the "
     "model's path without readings."
