@@ -37,7 +37,7 @@ from flexneedle.lab.calibration.verdicts import (
 )
 from flexneedle.lab.commands.validate import add_parser
 from flexneedle.scenario.files import load_scenario
-from report_page import Page
+from report_page import Page, save_nothing
 from simulated_session import AXIS, keys, simulate, without_slopes
 
 GEL = load_scenario("gel").with_values({"setup.axes": 2})
@@ -280,10 +280,11 @@ def test_ends_are_of_insertions_in_which_the_guide_rests(found):
 
 
 def test_guide_motion_is_the_largest_after_the_start(session):
-    one = replace(session.recordings[0], guide=np.array([[0.0, 0], [3, 0], [3, 4], [0, 0]]))
+    one = replace(session.recordings[0], guide=np.array([[0.0, 0], [3, 0], [3, 4], [0, 0], [0, 1]]))
     moved = guide_motion(one)
-    assert moved[0].tolist() == [0.0, 3.0, 5.0, 5.0]
-    assert moved[1, 2:].tolist() == [4.0, 4.0]
+    assert moved[0].tolist() == [0.0, 3.0, 5.0, 5.0, 5.0]
+    assert moved[1, 2:].tolist() == [4.0, 4.0, 4.0]
+    assert moved[3, 4] == 1.0
 
 
 def test_the_response_to_the_guide_is_the_model_s(found):
@@ -341,7 +342,8 @@ def test_the_page_is_one_file_with_verdict_figures_and_tables(found, tmp_path):
         assert all(row == table.headings for row in table.labels)
 
 
-def test_json_has_all_rows(session, tmp_path, capsys):
+def test_json_has_all_rows(session, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("flexneedle.lab.calibration.validation_report.page.save", save_nothing)
     both = Session((*session.recordings, *(replace(one, session="b") for one in session.recordings)))
     both.save(tmp_path)
     out = tmp_path / "out"
