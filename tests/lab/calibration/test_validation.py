@@ -29,6 +29,7 @@ from flexneedle.lab.calibration.validation_report.response import responses
 from flexneedle.lab.calibration.verdicts import (
     END,
     PREDICTORS,
+    Comparison,
     depth_limits,
     groups_of,
     headline,
@@ -223,6 +224,16 @@ def test_the_verdict_names_the_best_simple_predictor_and_the_ratio():
     assert judge("all", 20.0, made_errors(0.5, 1.0, insertions=2)).simple.word == "too few insertions"
 
 
+def test_a_ratio_whose_interval_has_1_in_it_is_no_win_and_no_loss():
+    ends = {
+        (0.8, 0.9): "better",
+        (0.8, 1.1): "not separable",
+        (1.1, 1.3): "worse",
+        (0.0, np.inf): "too few insertions",
+    }
+    assert {each: Comparison("stays", 1.0, 1.0, *each).word for each in ends} == ends
+
+
 def test_the_regression_is_never_the_best_without_guide_motion():
     errors = made_errors(0.5, 1.0)
     errors.size["regression"][:] = 0.1
@@ -294,6 +305,13 @@ def test_the_response_to_the_guide_is_the_model_s(found):
         assert one.model == pytest.approx(one.recorded, abs=1.5e-3)
         assert one.low <= one.recorded <= one.high
     assert shown[0].model < -0.01
+    doubled = [
+        replace(one, recording=replace(one.recording, slope=2.0 * one.recording.slope))
+        for one in found.tested
+    ]
+    for one, twice in zip(shown, responses(doubled, found.deepest), strict=True):
+        assert (twice.recorded, twice.low) == pytest.approx((2.0 * one.recorded, 2.0 * one.low))
+        assert twice.model == one.model
     assert abs(shown[-1].model) < abs(shown[0].model)
 
 
