@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.lab.calibration.ahead import steps_ahead
+from flexneedle.lab.calibration.criteria import steps_ahead
 from flexneedle.lab.calibration.session import Recording
 from flexneedle.types import Floats
 

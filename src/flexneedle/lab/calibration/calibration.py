@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.lab.calibration.fit import Fitted, Problem, fit
-from flexneedle.lab.calibration.intervals import Interval, intervals, profile
+from flexneedle.lab.calibration.criteria import Likelihood, PredictionErrors
+from flexneedle.lab.calibration.deviations import KINDS
+from flexneedle.lab.calibration.fit import Fitted, Problem, fit, reading_share
+from flexneedle.lab.calibration.intervals import Interval, fixed, intervals, profile
 from flexneedle.lab.calibration.parameters import Parameter, Trial, parameters_of, trial_of, with_trial
 from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
 from flexneedle.lab.calibration.session import Session
@@ -21,6 +23,7 @@ DEFAULT_FIT = ("stiffness", "bevel", "guide")
 _OTHER_STARTS = {"stiffness": (np.log(10.0), -np.log(10.0)), "yield": (np.log(0.3),)}
 """Further starts of a fit, as changes of a coordinate."""
 _SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
+_READINGS = 0.5  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
 _MOVED = 1e-3  # of the prior's standard deviation
 _ADVICE = {
     "stiffness": "move the guide by ±{guide:g} mm at depths of {depths} mm",
@@ -38,25 +41,24 @@ class Calibration:
 
     Attributes:
         start: The scenario before the fit.
-        fitted: The fit of the least cost.
+        session: The insertions.
+        fitted: The fit of all parameters with the least loss.
         others: The fits from other starts.
+        final: The fit with parameters that the data do not identify at their values in the scenario.
+        intervals: Intervals of 95 % by label, in the coordinates of the fit.
     """
 
     start: Scenario
     session: Session
     fitted: Fitted
-    others: tuple[Fitted, ...] = ()
+    others: tuple[Fitted, ...]
+    final: Fitted
+    intervals: dict[str, Interval]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The fitted parameters."""
         return self.fitted.problem.parameters
-
-    @cached_property
-    def intervals(self) -> dict[str, Interval]:
-        """Intervals of 95 % by label, in the coordinates of the fit."""
-        labels = (each.label for each in self.parameters)
-        return dict(zip(labels, intervals(self.fitted), strict=True))
 
     @cached_property
     def unidentified(self) -> dict[str, str]:
@@ -75,11 +77,7 @@ class Calibration:
     @cached_property
     def trial(self) -> Trial:
         """Values of all parameters: the scenario's for those that are not identified."""
-        point = self.fitted.point[: len(self.parameters)].copy()
-        for k, each in enumerate(self.parameters):
-            if each.label in self.unidentified:
-                point[k] = each.start
-        return trial_of(self.start, self.parameters, point)
+        return trial_of(self.start, self.parameters, self.final.point[: len(self.parameters)])
 
     @property
     def direction(self) -> float:
@@ -93,7 +91,7 @@ class Calibration:
 
     def _priors(self) -> Iterator[tuple[str, float]]:
         """Yield the priors of the controller: interval, and variation from insertion to insertion."""
-        gain = float(self.fitted.noise.sd[6])
+        gain = float(self.final.noise.sd[KINDS.index("gain")])
         found = {each.name: each for each in self.parameters if each.label not in self.unidentified}
         if "stiffness" in found:
             sd = self._sd(found["stiffness"])
@@ -119,7 +117,7 @@ class Calibration:
         point, sd = self.fitted.point, self.fitted.problem.sd
         if not self.fitted.settled:
             yield "the fit did not settle"
-        if not self.fitted.converged:
+        if not self.fitted.residuals.converged:
             yield "some steps of the model did not converge"
         for each, interval in zip(self.parameters, self.intervals.values(), strict=True):
             if interval.bound:
@@ -164,14 +162,14 @@ class Calibration:
 
 
 def calibrate(
-    scenario: Scenario | str | Path, session: Session, fit_names: Sequence[str] = DEFAULT_FIT
+    scenario: Scenario | str | Path, session: Session, fit: Sequence[str] = DEFAULT_FIT
 ) -> Calibration:
     """Fit a scenario to a session.
 
     Args:
         scenario: Start of the fit, and priors; as for `load_scenario`.
         session: Recorded insertions, from `load_session`.
-        fit_names: Parameters: stiffness, bevel, guide, clearance, yield, drift.
+        fit: Parameters: stiffness, bevel, guide, clearance, yield, drift.
 
     Raises:
         InputError: The session is empty, or a parameter cannot be fitted in this scenario.
@@ -182,15 +180,27 @@ def calibrate(
     loaded = load_scenario(scenario)
     prepared = fitting_scenario(loaded, session)
     reached = max(float(one.depth.max()) for one in session.recordings)
-    problem = Problem(prepared, parameters_of(prepared, fit_names, reached), Replay.of(session))
-    fits = [fit(problem, start) for start in _starts(problem)]
-    best, *others = sorted(fits, key=lambda each: each.cost)
-    return Calibration(loaded, session, best, tuple(others))
+    problem = Problem(prepared, parameters_of(prepared, fit, reached), Replay.of(session))
+    best, others = _minimize(problem)
+    free = _identify(best)
+    return Calibration(loaded, session, best, others, *free)
 
 
-def _starts(problem: Problem) -> Iterator[Floats]:
-    """Yield the starts of the fit: the scenario, and others for parameters with several minima."""
-    yield problem.start
+def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
+    """Return the fit of the least loss, and those from other starts.
+
+    By the likelihood if predictions have more error from the readings than from what the model lacks; else by their errors.
+    """
+    chosen = fit(problem, Likelihood)
+    if reading_share(chosen) < _READINGS:
+        chosen = fit(problem, PredictionErrors)
+    again = (fit(problem, chosen.criterion, start, chosen.noise) for start in _other_starts(problem))
+    best, *others = sorted([chosen, *again], key=lambda each: each.cost)
+    return best, tuple(others)
+
+
+def _other_starts(problem: Problem) -> Iterator[Floats]:
+    """Yield starts of the fit besides the prior's mean, for parameters with several minima."""
     for name, changes in _OTHER_STARTS.items():
         places = [k for k, each in enumerate(problem.parameters) if each.name == name]
         for change in changes if places else ():
@@ -199,6 +209,20 @@ def _starts(problem: Problem) -> Iterator[Floats]:
             yield np.clip(start, *problem.bounds)
 
 
-def split(session: Session) -> tuple[Session, Session]:
-    """Return the halves of a session for training and test: every other insertion of each session."""
-    return session.even, session.odd
+def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
+    """Return the fit with what the data do not identify at the start's values, and the intervals of all parameters.
+
+    One parameter is fixed at a time, the least identified first: another may be identified once it is.
+    """
+    found: dict[str, Interval] = {}
+    while True:
+        labels = [each.label for each in fitted.problem.parameters]
+        now = dict(zip(labels, intervals(fitted), strict=True))
+        open_ones = [label for label in labels if label not in found and not now[label].identified]
+        if not open_ones:
+            return fitted, now | found
+        widths = {each.label: each.useful for each in fitted.problem.parameters}
+        worst = max(open_ones, key=lambda label: (now[label].high - now[label].low) / widths[label])
+        found[worst] = now[worst]
+        k = labels.index(worst)
+        fitted = fixed(fitted, k, fitted.problem.parameters[k].start)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.lab.calibration.baselines import Pairs, Predictor, pairs_ahead, predictors, rests, whole
+from flexneedle.lab.calibration.criteria import PredictionErrors
 from flexneedle.lab.calibration.deviations import Noise
 from flexneedle.lab.calibration.fit import Fitted, Problem, conclude, fit, paths_at, residuals_at
 from flexneedle.lab.calibration.folds import Fold, sessions_of
@@ -115,7 +116,7 @@ def fit_nuisances(scenario: Scenario, training: Session, drift: float) -> Fitted
     free = parameters_of(scenario, ("bevel",), 0.0) if scenario.needle.bevel.offset_mm > 0.0 else ()
     start = _fit_direction(Problem(scenario, (*free, *fixed), replay), len(free))
     known = [_fix(each, value) for each, value in zip(free, start.tolist(), strict=False)]
-    return fit(Problem(scenario, (*known, *fixed), replay), start)
+    return fit(Problem(scenario, (*known, *fixed), replay), PredictionErrors, start)
 
 
 def _fit_direction(problem: Problem, axes: int) -> Floats:
@@ -123,7 +124,8 @@ def _fit_direction(problem: Problem, axes: int) -> Floats:
     point = problem.start
     for _ in range(_STEPS if axes else 0):
         found = residuals_at(problem, point)
-        ended = conclude(problem, paths_at(problem, found.tips), Noise.first(), point, found, settled=False)
+        paths = paths_at(problem, found.tips)
+        ended = conclude(problem, PredictionErrors, paths, Noise.first(), point, found)
         pull = (problem.start - point) / problem.sd**2
         point = point + np.linalg.solve(ended.information, ended.slopes.T @ ended.errors + pull)
     size = max(float(np.linalg.norm(point[:axes])), 1e-9)

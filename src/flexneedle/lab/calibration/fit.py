@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
-from flexneedle.lab.calibration.ahead import HORIZONS, Rows, predict_ahead
-from flexneedle.lab.calibration.deviations import Deviations, Noise, Whitened, estimate_noise
+from flexneedle.lab.calibration.criteria import Criterion, predict_ahead
+from flexneedle.lab.calibration.deviations import KINDS, Deviations, Noise, Whitened, estimate_noise
 from flexneedle.lab.calibration.parameters import Parameter, make_needle, trial_of
 from flexneedle.lab.calibration.prediction import Replay
 from flexneedle.scenario.model import Scenario
@@ -16,7 +16,6 @@ from flexneedle.types import Floats
 
 _ROUNDS = 10  # of parameters, noise and weights
 _SETTLED = 0.1  # change of a parameter, in standard deviations, at which the rounds end
-_LEAST_SD = 0.01  # mm; of the errors of predictions
 _AXIS_SD = 0.05  # rad; prior standard deviation of the sensor's axis about the needle's
 
 
@@ -133,59 +132,15 @@ def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
 
 
 @dataclass(frozen=True, eq=False)
-class Predictions:
-    """Predictions of all recordings: `Rows` for each recording and axis, standard deviations (h,) of the errors (mm) by
-    horizon, and the weight of an error.
-    """
-
-    rows: list[Rows]
-    sd: Floats
-    weight: float
-
-    @staticmethod
-    def of(problem: Problem, paths: Sequence[Whitened], noise: Noise, found: Residuals) -> "Predictions":
-        """Return the predictions, with the root mean squares of their errors at the residuals.
-
-        Errors of overlapping predictions are not independent: each counts by the share of its advance that is its own.
-        """
-        depths = [one.depth for one in problem.replay.recordings]
-        reached = max(float(np.ptp(depth)) for depth in depths)
-        spacing = float(np.mean(np.concatenate([np.diff(depth) for depth in depths])))
-        rows = [predict_ahead(path, noise, reached) for path in paths]
-        errors = np.concatenate([each.rows @ values for each, values in zip(rows, found.values, strict=True)])
-        horizon = np.concatenate([each.horizon for each in rows])
-        sd = np.ones(len(HORIZONS))
-        for k in np.unique(horizon):
-            sd[k] = max(float(np.sqrt(np.mean(errors[horizon == k] ** 2))), _LEAST_SD)
-        overlap = float(np.exp(np.mean(np.log(HORIZONS)))) * reached / spacing
-        return Predictions(rows, sd, 1.0 / (len(HORIZONS) * max(overlap, 1.0)))
-
-    def scale(self, found: Residuals) -> tuple[Floats, Floats, Floats]:
-        """Return errors (m,) over their standard deviations, derivatives (m, p + s), and the recording (m,) of each."""
-        parts = [
-            (each.rows @ value / self.sd[each.horizon], each.rows @ slope / self.sd[each.horizon, None])
-            for each, value, slope in zip(self.rows, found.values, found.slopes, strict=True)
-        ]
-        axes = len(self.rows) // len(found.tips)
-        groups = np.repeat(np.arange(len(self.rows)) // axes, [len(each.rows) for each in self.rows])
-        return np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts]), groups
-
-    def loss(self, errors: Floats) -> float:
-        """Return −2 ln of the likelihood of scaled errors (m,): twice the pseudo-Huber loss, and of their scales."""
-        horizon = np.concatenate([each.horizon for each in self.rows])
-        each = 2.0 * (np.sqrt(1.0 + errors**2) - 1.0) + 2.0 * np.log(self.sd[horizon])
-        return self.weight * float(each.sum())
-
-
-@dataclass(frozen=True, eq=False)
 class Fitted:
-    """The end of a fit: point, noise, and the errors of predictions there.
+    """The end of a fit: point, noise, and what the criterion has there.
 
-    cost: −2 ln of the likelihood, with the prior; errors (m,), scaled and weighted, with derivatives (m, p + s); groups
-    (m,): recording of each; settled: whether the rounds ended before the last.
+    cost: the loss, with the prior; errors (m,), with the weights of iterated least squares, derivatives (m, p + s), and
+    groups (m,), the recording of each; residuals: at the point; settled: whether the rounds ended before the last.
     """
 
     problem: Problem
+    criterion: type[Criterion]
     point: Floats
     noise: Noise
     paths: list[Whitened]
@@ -193,9 +148,8 @@ class Fitted:
     errors: Floats
     slopes: Floats
     groups: Floats
-    tips: Floats
+    residuals: Residuals
     settled: bool
-    converged: bool
 
     @cached_property
     def information(self) -> Floats:
@@ -203,23 +157,36 @@ class Fitted:
         found: Floats = self.slopes.T @ self.slopes + np.diag(self.problem.sd**-2.0)
         return found
 
+    @cached_property
+    def without(self) -> Floats:
+        """Points (n, p + s) without one recording each: one step of Gauss–Newton from that of all."""
+        gradient = self.slopes.T @ self.errors + (self.problem.start - self.point) / self.problem.sd**2
+        moves = []
+        for n in range(len(self.problem.replay.recordings)):
+            rows = self.groups == n
+            less = self.information - self.slopes[rows].T @ self.slopes[rows]
+            moves.append(np.linalg.solve(less, gradient - self.slopes[rows].T @ self.errors[rows]))
+        return self.point + np.array(moves)
 
-def fit(problem: Problem, start: Floats | None = None, noise: Noise | None = None) -> Fitted:
-    """Return the parameters of the least errors of predictions, with their prior, from a start (default: the prior)."""
+
+def fit(
+    problem: Problem, criterion: type[Criterion], start: Floats | None = None, noise: Noise | None = None
+) -> Fitted:
+    """Return the parameters with the least loss, and their noise, from a start (default: the prior's mean)."""
     point = problem.start if start is None else start
-    noise, settled = noise or Noise.first(), False
+    noise = noise or Noise.first()
     found = residuals_at(problem, point)
     problem = replace(problem, replay=problem.replay.corrected(found.tips))
     found = residuals_at(problem, point)
     paths = paths_at(problem, found.tips)
     for _ in range(_ROUNDS):
         before = point
-        predictions = Predictions.of(problem, paths, noise, found)
-        point, found = _least_squares(problem, predictions, point)
-        paths = _renew(problem, paths, found)
+        point, found = _least_squares(problem, criterion.of(paths, noise, found.values), point)
+        new = paths_at(problem, found.tips)
+        paths = [replace(path, factors=old.factors) for path, old in zip(new, paths, strict=True)]
         noise = estimate_noise(paths, found.values, noise)
         paths = [path.with_factors_for(noise, value) for path, value in zip(paths, found.values, strict=True)]
-        ended = conclude(problem, paths, noise, point, found, settled)
+        ended = conclude(problem, criterion, paths, noise, point, found)
         scale = np.sqrt(np.diag(np.linalg.inv(ended.information)))
         if (np.abs(point - before) < _SETTLED * scale).all():
             return replace(ended, settled=True)
@@ -227,31 +194,35 @@ def fit(problem: Problem, start: Floats | None = None, noise: Noise | None = Non
 
 
 def conclude(
-    problem: Problem, paths: list[Whitened], noise: Noise, point: Floats, found: Residuals, settled: bool
+    problem: Problem, criterion: type[Criterion], paths: list[Whitened], noise: Noise, point: Floats, found: Residuals
 ) -> Fitted:
-    """Return the fit at a point with its errors."""
-    predictions = Predictions.of(problem, paths, noise, found)
-    errors, slopes, groups = predictions.scale(found)
+    """Return the fit at a point, not settled."""
+    given = criterion.of(paths, noise, found.values)
+    errors, slopes = _errors(given, found)
+    loss, weight, _ = given.rho(errors**2)
     off = (point - problem.start) / problem.sd
-    # Weights of iterated least squares for the pseudo-Huber loss.
-    root = np.sqrt(predictions.weight) * (1.0 + errors**2) ** -0.25
-    cost = predictions.loss(errors) + float(off @ off)
+    axes = problem.replay.axes
+    groups = np.repeat(np.arange(len(paths)) // axes, [len(each) for each in given.rows])
+    root = np.sqrt(weight)
     return Fitted(
-        problem, point, noise, paths, cost, root * errors, root[:, None] * slopes, groups, found.tips, settled,
-        found.converged,
+        problem, criterion, point, noise, paths, float(loss.sum() + off @ off) + given.constant,
+        root * errors, root[:, None] * slopes, groups, found, False,
     )  # fmt: skip
 
 
-def _renew(problem: Problem, paths: Sequence[Whitened], found: Residuals) -> list[Whitened]:
-    """Return the paths about other tips, with the same factors of the intervals."""
-    new = paths_at(problem, found.tips)
-    return [replace(path, factors=old.factors) for path, old in zip(new, paths, strict=True)]
+def _errors(criterion: Criterion, found: Residuals) -> tuple[Floats, Floats]:
+    """Return errors (m,) and their derivatives (m, p + s), of the opposite sign."""
+    rows = criterion.rows
+    return (
+        np.concatenate([each @ value for each, value in zip(rows, found.values, strict=True)]),
+        np.concatenate([each @ slope for each, slope in zip(rows, found.slopes, strict=True)]),
+    )
 
 
-def _least_squares(problem: Problem, predictions: Predictions, start: Floats) -> tuple[Floats, Residuals]:
-    """Return the point of the least loss for given predictions, and its residuals."""
+def _least_squares(problem: Problem, criterion: Criterion, start: Floats) -> tuple[Floats, Residuals]:
+    """Return the point of the least loss of a criterion, and its residuals."""
     known: dict[bytes, Residuals] = {}
-    root = np.sqrt(predictions.weight)
+    size = len(start)
 
     def at(point: Floats) -> Residuals:
         key = point.tobytes()
@@ -260,26 +231,33 @@ def _least_squares(problem: Problem, predictions: Predictions, start: Floats) ->
         return known[key]
 
     def misfit(point: Floats) -> Floats:
-        return np.append(root * predictions.scale(at(point))[0], (problem.start - point) / problem.sd)
+        return np.append(_errors(criterion, at(point))[0], (problem.start - point) / problem.sd)
 
     def derivative(point: Floats) -> Floats:
-        return -np.vstack([root * predictions.scale(at(point))[1], np.diag(1.0 / problem.sd)])
+        return -np.vstack([_errors(criterion, at(point))[1], np.diag(1.0 / problem.sd)])
 
-    def loss(squares: Floats) -> Floats:
-        """Return the loss, and its derivatives, of squared weighted errors: pseudo-Huber, and squares of the prior."""
-        rho = np.stack([squares, np.ones_like(squares), np.zeros_like(squares)])
-        data = slice(None, -len(start))
-        z = 1.0 + squares[data] / predictions.weight
-        rho[:, data] = [
-            2.0 * predictions.weight * (z**0.5 - 1.0),
-            z**-0.5,
-            -0.5 / predictions.weight * z**-1.5,
-        ]
-        return rho
+    def rho(squares: Floats) -> Floats:
+        prior = squares[-size:]
+        quadratic = np.stack([prior, np.ones(size), np.zeros(size)])
+        return np.hstack([criterion.rho(squares[:-size]), quadratic])
 
     low, high = problem.bounds
     inside = np.clip(start, low + 1e-9, high - 1e-9)
     found = least_squares(
-        misfit, inside, derivative, bounds=(low, high), loss=loss, x_scale="jac", xtol=1e-4, ftol=1e-6, max_nfev=12
+        misfit, inside, derivative, bounds=(low, high), loss=rho, x_scale="jac", xtol=1e-4, ftol=1e-6, max_nfev=12
     )
     return found.x, at(found.x)
+
+
+def reading_share(fitted: Fitted) -> float:
+    """Return the share of errors of readings in the variance of predictions ahead; the rest is what the model lacks."""
+    reached = max(float(np.ptp(path.deviations.depth)) for path in fitted.paths)
+    readings = fitted.noise.without(range(len(KINDS) - 2))
+    parts = np.zeros(2)
+    for path in fitted.paths:
+        rows, _ = predict_ahead(path, fitted.noise, reached)
+        start = path.start
+        parts += [
+            np.einsum("ai,ij,aj->", rows, path.covariance(noise) - start, rows) for noise in (readings, fitted.noise)
+        ]
+    return float(parts[0] / parts[1])

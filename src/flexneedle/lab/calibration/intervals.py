@@ -33,17 +33,9 @@ def jackknife(fitted: Fitted) -> Floats:
     Each point without a recording is one Gauss–Newton step from that of all, in which the prior keeps its weight
     (Efron and Stein 1981, doi:10.1214/aos/1176345462).
     """
-    point, prior = fitted.point, fitted.problem.sd**-2.0
-    pull = prior * (fitted.problem.start - point)
-    groups, information = np.unique(fitted.groups), fitted.information
-    gradient = fitted.slopes.T @ fitted.errors + pull
-    moved = []
-    for one in groups:
-        rows = fitted.groups == one
-        less = information - fitted.slopes[rows].T @ fitted.slopes[rows]
-        moved.append(np.linalg.solve(less, gradient - fitted.slopes[rows].T @ fitted.errors[rows]))
-    off = np.array(moved) - np.mean(moved, axis=0)
-    count = len(groups)
+    moved = fitted.without
+    off = moved - moved.mean(axis=0)
+    count = len(moved)
     covariance: Floats = (count - 1.0) / count * off.T @ off
     return covariance
 
@@ -107,8 +99,7 @@ def fixed(fitted: Fitted, k: int, value: float) -> Fitted:
     parameters = (*problem.parameters[:k], tight, *problem.parameters[k + 1 :])
     start = fitted.point.copy()
     start[k] = value
-    again = fit(Problem(problem.scenario, parameters, problem.replay), start, fitted.noise)
-    return again
+    return fit(Problem(problem.scenario, parameters, problem.replay), fitted.criterion, start, fitted.noise)
 
 
 def profile(fitted: Fitted, k: int, values: Sequence[float]) -> Floats:
