@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flexneedle.arguments import check_covariance, make_refusal, read_numbers, read_rows
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 Point = tuple[float, float, float]
 """x, y, z (mm)."""
 Lateral = tuple[float, float]

@@ -1,5 +1,7 @@
 """Forecasts of paths whose deviations are drawn from the noise model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ def model_path(seed=0):
     random = np.random.default_rng(seed)
     slope = np.cumsum(0.02 * random.normal(size=COUNT))
     position = np.append(0.0, np.cumsum(2.5 * (slope[1:] + slope[:-1])))
-    return Deviations(DEPTH, position, slope)
+    return Deviations(DEPTH, position, slope, np.zeros(COUNT, dtype=bool))
 
 
 def draw(deviations, noise, random):
@@ -94,7 +96,7 @@ def test_after_exact_readings_the_next_step_has_the_variance_of_its_disturbance(
 def test_mirrored_readings_have_the_mirrored_forecast():
     deviations = model_path()
     residuals = draw(deviations, PLAIN, np.random.default_rng(4))
-    mirrored = Deviations(DEPTH, -deviations.position, -deviations.slope)
+    mirrored = replace(deviations, position=-deviations.position, slope=-deviations.slope)
     mean, sd = expect_deviations(whole(deviations), PLAIN, residuals)
     other, same = expect_deviations(whole(mirrored), PLAIN, -residuals)
     np.testing.assert_allclose(other, -mean, atol=1e-12)

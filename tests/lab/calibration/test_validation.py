@@ -78,9 +78,10 @@ def test_the_model_that_made_the_recordings_wins(found):
 
 
 def test_a_model_of_much_softer_tissue_loses_and_says_it(session):
-    soft = validate(GEL.with_values({"tissue.0.shear_modulus_kpa": 10.0}), session, AHEAD)
+    changes = {"tissue.0.shear_modulus_kpa": 10.0, "setup.guide_to_skin_mm": 11.0}
+    soft = validate(GEL.with_values(changes), session, (5.0, 10.0))
     assert [one.simple.word for one in soft.verdicts[:2]] == ["worse"] * 2
-    assert "the model loses 10 and 20 mm ahead, guided" in soft.verdict[0]
+    assert "the model loses 5 and 10 mm ahead, guided" in soft.verdict[0]
 
 
 @pytest.mark.parametrize("angle", [0.6, -2.4])
@@ -89,7 +90,7 @@ def test_direction_and_axis_follow_from_the_training_insertions(angle):
     fitted = fit_nuisances(fitting_scenario(GEL, session), session, 0.0)
     assert np.hypot(*fitted.point[:2]) == pytest.approx(GEL.needle.bevel.offset_mm, rel=1e-3)
     assert np.angle(complex(*fitted.point[:2])) == pytest.approx(angle, abs=0.1)
-    np.testing.assert_allclose(fitted.point[2:], AXIS, atol=1.5e-3)
+    np.testing.assert_allclose(fitted.point[2:4], AXIS, atol=1.5e-3)
 
 
 def test_in_the_plane_the_direction_is_a_sign():
@@ -102,7 +103,7 @@ def test_in_the_plane_the_direction_is_a_sign():
 def test_a_needle_without_a_bevel_has_no_direction():
     session = simulate(4, moves=2.0, **{"needle.bevel.offset_mm": 0.0})
     scenario = fitting_scenario(GEL.with_values({"needle.bevel.offset_mm": 0.0}), session)
-    np.testing.assert_allclose(fit_nuisances(scenario, session, 0.0).point, AXIS, atol=1.5e-3)
+    np.testing.assert_allclose(fit_nuisances(scenario, session, 0.0).point[:2], AXIS, atol=1.5e-3)
 
 
 def test_mirrored_recordings_have_the_same_errors():

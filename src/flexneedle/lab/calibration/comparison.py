@@ -16,7 +16,7 @@ from flexneedle.lab.calibration.parameters import Parameter, parameters_of
 from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
 from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats
+from flexneedle.types import Flags, Floats
 
 MODEL = "model"
 GUIDED_MM = 1.0
@@ -25,8 +25,6 @@ WIDTH = 1.96
 """Standard deviations of half an interval of 95 %."""
 _STEPS = 3  # of Gauss and Newton, of a path that is nearly linear in the bevel
 _FIXED = 1e-6  # standard deviation of the prior of a parameter that is known
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

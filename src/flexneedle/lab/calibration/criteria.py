@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 from flexneedle.lab.calibration.deviations import GAIN_KINDS, Noise, Whitened
 from flexneedle.types import Floats
 
-HORIZONS = (0.1, 0.2, 0.4, 0.8)
+HORIZONS = (0.1, 0.2, 0.4, 1.0)
 """Horizons of predictions, as shares of the depth that is reached."""
 _NEAR = 1.0 / 3.0  # largest difference of a prediction's length from its horizon, relative to it
 _LEAST_SD = 0.01  # mm; of the errors of predictions
@@ -66,8 +66,9 @@ class Likelihood:
 
 @dataclass(frozen=True, eq=False)
 class PredictionErrors:
-    """Pseudo-Huber loss of the errors of predictions ahead, relative to their root mean square at each horizon.
+    """Pseudo-Huber loss of the errors of predictions ahead, relative to their root mean square in each class.
 
+    Classes are horizons, with and without motions of guide, base or roll.
     Errors of overlapping predictions are not independent: each has the weight of the share of its advance that is its own.
     """
 
@@ -85,8 +86,8 @@ class PredictionErrors:
         weight = 1.0 / (len(HORIZONS) * max(overlap, 1.0))
         predictions = [predict_ahead(path, noise, reached) for path in paths]
         sd = np.maximum(root_mean_squares(predictions, residuals), _LEAST_SD)
-        rows = [np.sqrt(weight) * each / sd[horizon, None] for each, horizon in predictions]
-        logs = sum(float(np.log(sd[horizon]).sum()) for _, horizon in predictions)
+        rows = [np.sqrt(weight) * each / sd[kind, None] for each, kind in predictions]
+        logs = sum(float(np.log(sd[kind]).sum()) for _, kind in predictions)
         return cls(rows, weight, 2.0 * weight * logs)
 
     def rho(self, squares: Floats) -> Floats:
@@ -96,35 +97,36 @@ class PredictionErrors:
 
 
 def root_mean_squares(predictions: Sequence[tuple[Floats, Floats]], residuals: Sequence[Floats]) -> Floats:
-    """Return root mean squares (h,) of the errors (mm) at each horizon, 0 where there are none."""
+    """Return root mean squares (2 h,) of the errors (mm) in each class, 0 where there are none."""
     errors = np.concatenate([rows @ left for (rows, _), left in zip(predictions, residuals, strict=True)])
-    horizon = np.concatenate([each for _, each in predictions])
-    counts = np.bincount(horizon, minlength=len(HORIZONS))
-    found: Floats = np.sqrt(np.bincount(horizon, errors**2, len(HORIZONS)) / np.maximum(counts, 1))
+    kinds = np.concatenate([each for _, each in predictions])
+    counts = np.bincount(kinds, minlength=2 * len(HORIZONS))
+    found: Floats = np.sqrt(np.bincount(kinds, errors**2, 2 * len(HORIZONS)) / np.maximum(counts, 1))
     return found
 
 
 def predict_ahead(path: Whitened, noise: Noise, reached: float) -> tuple[Floats, Floats]:
-    """Return predictions of positions from all readings up to a step: rows (a, r) of their errors, horizons (a,).
+    """Return predictions of positions from all readings up to a step: rows (a, r) of their errors, classes (a,).
 
     The errors that an insertion has as a whole are not estimated from its first steps: the parameters have to give them.
     """
     covariance = path.covariance(noise.without(GAIN_KINDS))
-    count = len(path.deviations.depth)
+    depth, moved = path.deviations.depth, path.deviations.moved
+    count = len(depth)
     steps = np.tile(np.arange(count), 2)[path.known]
     place = np.full(2 * count, -1)
     place[path.known] = np.arange(len(steps))
-    rows, horizons = list[Floats](), list[int]()
+    rows, kinds = list[Floats](), list[int]()
     for k, share in enumerate(HORIZONS):
-        for i, j in steps_ahead(path.deviations.depth, share * reached):
+        for i, j in steps_ahead(depth, share * reached):
             before, at = np.flatnonzero(steps <= i), place[j]
             if at >= 0 and len(before):
                 row = np.zeros(len(steps))
                 row[at] = 1.0
                 row[before] = -np.linalg.solve(covariance[np.ix_(before, before)], covariance[before, at])
                 rows.append(row)
-                horizons.append(k)
-    return np.array(rows).reshape(-1, len(steps)), np.array(horizons, dtype=int)
+                kinds.append(k + len(HORIZONS) * bool(moved[i + 1 : j + 1].any()))
+    return np.array(rows).reshape(-1, len(steps)), np.array(kinds, dtype=int)
 
 
 def steps_ahead(depth: Floats, length: float) -> list[tuple[int, int]]:

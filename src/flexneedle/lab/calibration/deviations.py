@@ -27,7 +27,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
-from flexneedle.types import Floats
+from flexneedle.types import Flags, Floats
 
 KINDS = ("heading", "lateral", "turn", "response", "shift", "curvature", "gain", "position", "slope")
 """Kinds of errors, in the order of their standard deviations."""
@@ -80,11 +80,15 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """Errors of a path on an axis: k steps at depths (k,), about the model's positions and slopes (k,) there."""
+    """Errors of a path on an axis: k steps at depths (k,), about the model's positions and slopes (k,) there.
+
+    moved (k,): whether guide, base or roll moved since the step before.
+    """
 
     depth: Floats
     position: Floats
     slope: Floats
+    moved: Flags
 
     @cached_property
     def advance(self) -> Floats:

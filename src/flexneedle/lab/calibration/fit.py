@@ -17,13 +17,16 @@ from flexneedle.types import Floats
 _ROUNDS = 10  # of parameters, noise and weights
 _SETTLED = 0.1  # change of a parameter, in standard deviations, at which the rounds end
 _AXIS_SD = 0.05  # rad; prior standard deviation of the sensor's axis about the needle's
+_LEVER_SD = 10.0  # mm; prior standard deviation of the lever of the sensor
+_FAR = 20.0  # standard deviations, to the bounds of axis and lever
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A fit: scenario, parameters, recordings.
 
-    The point of a fit has the p parameters, then the slope (rad) of the sensor's axis for each session and axis.
+    The point of a fit has the p parameters, then for each session the slope (rad) of the sensor's axis on each axis, and
+    the lever of the sensor (mm): its distance from the point whose path the model predicts, along the needle.
     """
 
     scenario: Scenario
@@ -36,56 +39,52 @@ class Problem:
         return tuple(dict.fromkeys(one.session for one in self.replay.recordings))
 
     @cached_property
+    def _nuisances(self) -> Floats:
+        """Standard deviations of what is fitted besides the parameters."""
+        return np.tile([*(_AXIS_SD,) * self.replay.axes, _LEVER_SD], len(self.sessions))
+
+    @cached_property
     def start(self) -> Floats:
         """The prior's mean."""
-        offsets = np.zeros(len(self.sessions) * self.replay.axes)
-        return np.append([each.start for each in self.parameters], offsets)
+        return np.append([each.start for each in self.parameters], 0.0 * self._nuisances)
 
     @cached_property
     def sd(self) -> Floats:
         """Standard deviations of the prior."""
-        offsets = np.full(len(self.start) - len(self.parameters), _AXIS_SD)
-        return np.append([each.sd for each in self.parameters], offsets)
+        return np.append([each.sd for each in self.parameters], self._nuisances)
 
     @cached_property
     def bounds(self) -> Floats:
         """Lower and upper bounds (2, p + s)."""
-        offsets = np.ones(len(self.start) - len(self.parameters))
-        low = np.append([each.low for each in self.parameters], -offsets)
-        return np.stack([low, np.append([each.high for each in self.parameters], offsets)])
+        far = _FAR * self._nuisances
+        low = np.append([each.low for each in self.parameters], -far)
+        return np.stack([low, np.append([each.high for each in self.parameters], far)])
 
     def tips(self, points: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return the tips (v, n, k, 5) at points, and whether all solves converged (v, n)."""
         trials = [trial_of(self.scenario, self.parameters, point[: len(self.parameters)]) for point in points]
         return self.replay.predict([make_needle(self.scenario, trial) for trial in trials])
 
-    def offset(self, point: Floats, recording: int) -> Floats:
-        """Return the slope (axes,) of the sensor's axis in a recording."""
-        axes, session = self.replay.axes, self.sessions.index(self.replay.recordings[recording].session)
-        first = len(self.parameters) + axes * session
-        return point[first : first + axes]
+    def nuisances(self, recording: int) -> slice:
+        """Return the place of the axis and the lever of a recording's sensor in a point."""
+        count = self.replay.axes + 1
+        first = len(self.parameters) + count * self.sessions.index(self.replay.recordings[recording].session)
+        return slice(first, first + count)
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """Residuals of all recordings at a point on all axes, with their derivatives.
 
-    values: (r,) for each recording and axis; slopes: (r, p + s); tips (n, k, 5).
+    values: (r,) for each recording and axis; slopes: (r, p + s); models: predicted readings (2 k,), for each of them, too;
+    tips (n, k, 5).
     """
 
     values: list[Floats]
     slopes: list[Floats]
+    models: list[Floats]
     tips: Floats
     converged: bool
-
-
-def known_of(problem: Problem) -> list[Floats]:
-    """Return for each recording and axis which positions, then slopes, are measured."""
-    return [
-        np.isfinite(np.append(one.position[:, axis], one.slope[:, axis]))
-        for one in problem.replay.recordings
-        for axis in range(problem.replay.axes)
-    ]
 
 
 def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -> Residuals:
@@ -99,24 +98,26 @@ def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -
         points += [point + np.eye(len(point))[k] * signs[k] * steps[k] for k in range(size)]
     tips, good = problem.tips(points)
     change = [(tips[1 + k] - tips[0]) / (signs[k] * steps[k]) for k in range(len(points) - 1)]
-    axes, values, slopes = problem.replay.axes, list[Floats](), list[Floats]()
+    values, slopes, models = list[Floats](), list[Floats](), list[Floats]()
     for n, one in enumerate(problem.replay.recordings):
-        count, offset = len(one.depth), problem.offset(point, n)
-        for axis in range(axes):
-            columns = [1 + axis, 3 + axis]
-            found = np.append(one.position[:, axis], one.slope[:, axis])
-            known = np.isfinite(found)
-            model = tips[0, n, :count, columns].ravel() + np.append(
-                np.zeros(count), np.full(count, offset[axis])
-            )
+        count, place = len(one.depth), problem.nuisances(n)
+        *offset, lever = point[place].tolist()
+        for axis in range(problem.replay.axes):
+            path = [tips[0, n, :count, 1 + axis], tips[0, n, :count, 3 + axis]]
+            turned = path[1] - path[1][0]
+            model = np.append(path[0] + lever * turned, path[1] + offset[axis])
             derivative = np.zeros((2 * count, len(point)))
             for k, each in enumerate(change):
-                derivative[:, k] = each[n, :count, columns].ravel()
-            session = problem.sessions.index(one.session)
-            derivative[count:, size + axes * session + axis] = 1.0
+                y, slope = each[n, :count, 1 + axis], each[n, :count, 3 + axis]
+                derivative[:, k] = np.append(y + lever * (slope - slope[0]), slope)
+            derivative[count:, place.start + axis] = 1.0
+            derivative[:count, place.stop - 1] = turned
+            found = np.append(one.position[:, axis], one.slope[:, axis])
+            known = np.isfinite(found)
             values.append((found - model)[known])
             slopes.append(derivative[known])
-    return Residuals(values, slopes, tips[0], bool(good.all()))
+            models.append(model)
+    return Residuals(values, slopes, models, tips[0], bool(good.all()))
 
 
 def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
@@ -126,7 +127,8 @@ def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
         count = len(one.depth)
         for axis in range(problem.replay.axes):
             known = np.isfinite(np.append(one.position[:, axis], one.slope[:, axis]))
-            deviations = Deviations(one.depth, tips[n, :count, 1 + axis], tips[n, :count, 3 + axis])
+            path = tips[n, :count, [1 + axis, 3 + axis]]
+            deviations = Deviations(one.depth, *path, one.moved)
             paths.append(Whitened(deviations, known, np.ones(count)))
     return paths
 

@@ -18,13 +18,14 @@ _UNKNOWN = TAIL / (TAIL - 2.0)  # mean of the prior of a factor
 class Forecast(NamedTuple):
     """Positions (k, k, axes) in mm predicted at steps j from the readings up to step i, and their standard deviations.
 
-    Positions up to i are estimates. The standard deviations include the error of a reading. model (k, 2 · axes): the
-    model's own position and slope at each step.
+    Positions up to i are estimates. The standard deviations include the error of a reading. model, slope (k, axes): the
+    model's own position, and slope (rad) of the sensor's axis, at each step.
     """
 
     position: Floats
     sd: Floats
     model: Floats
+    slope: Floats
 
 
 def forecast(fitted: Fitted, session: Session) -> list[Forecast]:
@@ -35,12 +36,13 @@ def forecast(fitted: Fitted, session: Session) -> list[Forecast]:
     found = residuals_at(problem, fitted.point, derivatives=False)
     paths, axes = paths_at(problem, found.tips), session.axes
     forecasts = []
-    for n, one in enumerate(session.recordings):
-        both = [expect_deviations(paths[k], fitted.noise, found.values[k]) for k in range(axes * n, axes * n + axes)]
+    for n in range(len(session.recordings)):
+        own = range(axes * n, axes * n + axes)
+        both = [expect_deviations(paths[k], fitted.noise, found.values[k]) for k in own]
         expected, sd = np.moveaxis(np.array(both), 0, -1)
-        tips = found.tips[n, : len(one.depth)]
-        model = np.column_stack([tips[:, 1 : 1 + axes], tips[:, 3 : 3 + axes]])
-        forecasts.append(Forecast(expected + model[:, :axes], sd, model))
+        model = np.array([found.models[k].reshape(2, -1) for k in own])
+        positions, slopes = np.moveaxis(model, 1, 0).swapaxes(1, 2)
+        forecasts.append(Forecast(expected + positions, sd, positions, slopes))
     return forecasts
 
 

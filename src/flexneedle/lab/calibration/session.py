@@ -15,12 +15,13 @@ import tomli_w
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.types import Floats
+from flexneedle.types import Flags, Floats
 
 STEPS_FILE, SESSION_FILE = "steps.parquet", "session.toml"
 GuideOrder = Literal["before", "with", "after"]
 """Motion of the guide before, with or after the advance from a step to the next."""
 _FORMAT = 1
+_STILL = 0.05  # mm or rad, up to which a stage is still
 _ACROSS = ("y", "z")
 _NUMBERS = ("position", "slope", "guide", "base")
 _UNITS = {"position": "mm", "slope": "rad", "guide": "mm", "base": "mm"}
@@ -61,6 +62,12 @@ class Recording:
     def guide_moves(self) -> float:
         """Largest distance (mm) of the guide from its first position."""
         return float(np.linalg.norm(self.guide - self.guide[0], axis=1).max())
+
+    @cached_property
+    def moved(self) -> Flags:
+        """Whether guide, base or roll moved (k,) since the step before."""
+        change = np.column_stack([self.guide, self.base, self.roll])
+        return np.append(False, (np.abs(np.diff(change, axis=0)) > _STILL).any(axis=1))
 
     def __repr__(self) -> str:
         return (

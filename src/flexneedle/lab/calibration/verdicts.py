@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.lab.calibration.baselines import REGRESSION
-from flexneedle.lab.calibration.comparison import MODEL, Errors, Flags
-from flexneedle.types import Floats
+from flexneedle.lab.calibration.comparison import MODEL, Errors
+from flexneedle.types import Flags, Floats
 
 _SHALLOW, _DEEP = 0.2, 0.45  # limits of groups by depth, as shares of the deepest step
 _ROUND_MM = 5.0

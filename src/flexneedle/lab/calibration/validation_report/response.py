@@ -45,7 +45,7 @@ def _changes(number: int, tested: Tested) -> Floats:
     """Return rows (r, 5) of all intervals and axes: insertion, depth, motion of the guide, changes of the slope."""
     one, axes = tested.recording, tested.recording.axes
     moved, turned = np.diff(one.guide, axis=0), np.diff(one.slope, axis=0)
-    model = np.diff(tested.forecast.model[:, axes:], axis=0)
+    model = np.diff(tested.forecast.slope, axis=0)
     depth = np.repeat(one.depth[:-1], axes)
     return np.column_stack([np.full(len(depth), number), depth, moved.ravel(), turned.ravel(), model.ravel()])
 
