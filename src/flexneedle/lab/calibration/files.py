@@ -22,7 +22,8 @@ def record_path(scenario: Path) -> Path:
 def write_calibration(found: Calibration, path: Path, source: str) -> None:
     """Write the calibrated scenario, and the record beside it. source: the scenario from which the fit started."""
     lines = [
-        f"# Calibrated from {source} with {len(found.session.recordings)} recorded insertions: {', '.join(found.session.names)}."
+        f"# Calibrated from {source} with {len(found.session.recordings)} recorded insertions of "
+        f"{', '.join(found.session.names)}."
     ]
     lines += [f"# {label}: {value} (95 %: {interval})" for label, value, interval in found.table()]
     if found.scenario.setup.axes == 2:

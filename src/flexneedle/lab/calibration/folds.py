@@ -84,7 +84,10 @@ def _source_of(given: Calibration | Scenario | str | Path) -> _Source:
 def _recorded(scenario: Scenario, record: dict[str, Any]) -> _Source:
     """Return the source of a scenario with a record of its fit. Raises InputError for a record without a key."""
     try:
-        start, names = Scenario.from_values(record["start"], "record of the calibration"), tuple(record["fit"])
+        start, names = (
+            Scenario.from_values(record["start"], "record of the calibration"),
+            tuple(record["fit"]),
+        )
         used = frozenset((str(session), str(name)) for session, name in record["insertions"])
         fitted = [each for label, each in record["parameters"].items() if label.startswith("drift")]
         drift = sum(each["value"] for each in fitted if each["identified"])
