@@ -25,7 +25,7 @@ _OTHER_STARTS = {"stiffness": (np.log(10.0), -np.log(10.0)), "yield": (np.log(0.
 """Further starts of a fit, as changes of a coordinate."""
 _SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
 _READINGS = 0.5  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
-_FIRST_ROUNDS = 2  # until the noise says which criterion to use
+_FIRST_ROUNDS = 2  # until the noise decides on the criterion
 _PROFILED = 1.5  # half-widths of the interval, to either side
 _MOVED = 1e-3  # of the prior's standard deviation
 _ADVICE = {

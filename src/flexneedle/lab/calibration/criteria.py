@@ -1,4 +1,4 @@
-"""What a fit minimizes: the likelihood of the readings, or the errors of predictions ahead (docs/theory.md, 13).
+"""Criteria of a fit: the likelihood of the readings, or the errors of predictions ahead (docs/theory.md, 13).
 
 The likelihood uses all readings best if the model lacks nothing. A model that lacks something is better identified by
 the errors of the predictions that it is used for, over the horizon of a controller (Shook, Mohtadi and Shah 1991,
@@ -36,7 +36,7 @@ class Criterion(Protocol):
 
     @property
     def constant(self) -> float:
-        """What the scales of the errors add to the loss."""
+        """Part of the loss by the scales of the errors."""
         ...
 
     def rho(self, squares: Floats) -> Floats:

@@ -4,7 +4,7 @@ On an axis the deviation at step i is (e, ξ): distance (mm) and heading (rad). 
 
     e ← e + ξ dx + a,    ξ ← ξ + b,
 
-with independent disturbances (a, b) in each interval. They have variances that are to be estimated, of
+with independent disturbances (a, b) in each interval. Their variances are estimated, of
 
     heading     a random walk of the heading, per mm of advance
     lateral     a random walk across the path, per mm of advance

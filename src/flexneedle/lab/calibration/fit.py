@@ -161,7 +161,7 @@ class Fitted:
 
     @cached_property
     def without(self) -> Floats:
-        """Points (n, p + s) without one recording each: one step of Gauss–Newton from that of all."""
+        """Points (n, p + s) without one recording each: one step of Gauss–Newton from the point."""
         gradient = self.slopes.T @ self.errors + (self.problem.start - self.point) / self.problem.sd**2
         moves = []
         for n in range(len(self.problem.replay.recordings)):

@@ -12,7 +12,7 @@ from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Flags, Floats
 
-_AIR_MM = 1.0  # the model starts at least so far before the skin, and behind the first step
+_AIR_MM = 1.0  # from the start of the model to the skin, and to the first step, at least
 _LONGEST_MM = 1.0  # advance in a step of the model
 
 
@@ -54,7 +54,7 @@ class Replay:
 
     @cached_property
     def commands(self) -> Floats:
-        """Commands (n, m, 9): for each step `_parts` of the advance, and a roll, and a motion of guide and base before, with or after."""
+        """Commands (n, m, 9): for each step a roll, `_parts` of the advance, and a motion of guide and base."""
         steps, width = max(len(depth) for depth in self.depths), self._parts + 2
         rows = np.zeros((len(self.recordings), steps, width, 9))
         at = {"before": slice(0, 1), "with": slice(1, -1), "after": slice(-1, None)}[self.guide_order]
@@ -76,7 +76,7 @@ class Replay:
     def predict(self, needles: Sequence[Needle]) -> tuple[Floats, Flags]:
         """Return tips (v, n, k, 5) by each of v needles at the steps of n recordings, and whether all solves converged.
 
-        Those of recordings with fewer than k steps repeat their last.
+        Recordings with fewer than k steps repeat their last tip.
         """
         states, models = [], []
         zero = (0.0,) * self.axes
@@ -88,7 +88,7 @@ class Replay:
         rows = np.tile(self.commands, (len(needles), 1, 1))
         out = needles[0].simulator.rollout(states, rows, models=models, limits=False)
         shape = len(needles), len(self.recordings), len(self._ends)
-        good: Flags = out.converged.reshape(*shape[:2], -1).all(axis=2)
+        good = np.logical_and.reduce(np.asarray(out.converged).reshape(*shape[:2], -1), axis=2)
         return out.tips[:, self._ends].reshape(*shape, 5), good
 
     def corrected(self, tips: Floats) -> "Replay":
