@@ -72,7 +72,7 @@ def test_the_scenario_has_the_values_and_priors(fitted):
     scenario = fitted.scenario
     assert scenario.tissue[0].shear_modulus_kpa == pytest.approx(330.0 * fitted.trial.stiffness[0])
     assert scenario.needle.bevel.offset_mm == pytest.approx(np.linalg.norm(fitted.trial.bevel))
-    assert scenario.control["adaptive_mpc"]["modulus_log_sd"] < 0.3
+    assert scenario.control.adaptive_mpc["modulus_log_sd"] < 0.3
 
 
 def test_open_loop_insertions_do_not_identify_the_stiffness():
