@@ -73,3 +73,16 @@ def test_wrong_arguments_are_one_line(arguments, line, folder, tmp_path, capsys)
     assert line in err
     assert len(err.strip().splitlines()) == 1
     assert not (tmp_path / "out.toml").exists()
+
+
+def test_a_design_needs_no_session(tmp_path, capsys):
+    status, printed, _ = run(capsys, "gel", "--design", "2", "--out", tmp_path / "out.toml")
+    assert status == 0
+    assert "stiffness of gel ×÷" in printed
+    assert not (tmp_path / "out.toml").exists()
+
+
+def test_a_fit_needs_a_session(capsys):
+    status, _, err = run(capsys, "gel")
+    assert status != 0
+    assert "SESSION: missing" in err

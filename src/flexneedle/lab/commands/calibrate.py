@@ -9,6 +9,8 @@ from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json, print_table
 from flexneedle.cli.progress import print_note
+from flexneedle.cli.values import make_number_type
+from flexneedle.errors import InputError
 
 
 def add_parser(commands: Commands) -> None:
@@ -23,7 +25,13 @@ def add_parser(commands: Commands) -> None:
         about="Fit a scenario to the insertions of a session. Exit status 1: the fit is not to be trusted, for the "
         "reasons that are printed.",
     )
-    parser.add_argument("session", metavar="SESSION", type=expand_home, help="folder of the session")
+    parser.add_argument(
+        "session",
+        metavar="SESSION",
+        nargs="?",
+        type=expand_home,
+        help="folder of the session; not for --design",
+    )
     parser.add_argument("scenario", metavar="SCENARIO", help="scenario from which the fit starts")
     parser.add_argument(
         "--fit",
@@ -39,6 +47,12 @@ def add_parser(commands: Commands) -> None:
         "--profile", metavar="NAME", help="draw the profile likelihood of a parameter, beside the scenario"
     )
     parser.add_argument(
+        "--design",
+        metavar="N",
+        type=make_number_type(int, 1, 20),
+        help="propose the N insertions that shrink the intervals most, and end",
+    )
+    parser.add_argument(
         "--out",
         metavar="FILE",
         type=expand_home,
@@ -49,6 +63,10 @@ def add_parser(commands: Commands) -> None:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
+    if args.design is not None:
+        return _design(args)
+    if args.session is None:
+        raise InputError("SESSION: missing: the folder of flexneedle import, before the scenario")
     from flexneedle.lab.calibration.calibration import calibrate
     from flexneedle.lab.calibration.files import read_record, write_calibration
     from flexneedle.lab.calibration.session import load_session
@@ -69,3 +87,21 @@ def _calibrate(args: argparse.Namespace) -> int:
     for problem in found.problems:
         print_note(problem)
     return 1 if found.problems else 0
+
+
+def _design(args: argparse.Namespace) -> int:
+    from flexneedle.lab.calibration.design import propose
+    from flexneedle.scenario.files import load_scenario
+
+    proposals = propose(load_scenario(args.scenario), args.fit, args.design)
+    rows = [
+        (
+            str(k),
+            f"{each.depth:.0f} mm",
+            "; ".join(f"at {x:.0f} mm to ({y:+.1f}, {z:+.1f}) mm" for x, y, z in each.moves) or "at rest",
+            ", ".join(parameter.format_width(width) for parameter, width in each.widths),
+        )
+        for k, each in enumerate(proposals, 1)
+    ]
+    print_table("", ("insertion", "depth", "guide (y, z)", "intervals of 95 % after it"), rows)
+    return 0
