@@ -17,7 +17,7 @@ from flexneedle.types import Flags, Floats
 
 _ROUNDS = 10  # of parameters, noise and weights
 _SETTLED = 0.1  # change of a parameter, in standard deviations, at which the rounds end
-_AXIS_SD = 0.05  # rad; prior standard deviation of the sensor's axis about the needle's
+_AXIS_SD = 0.2  # rad; prior standard deviation of the sensor's axis about the needle's
 _LEVER_SD = 10.0  # mm; prior standard deviation of the lever of the sensor
 _FAR = 20.0  # standard deviations, to the bounds of axis and lever
 
