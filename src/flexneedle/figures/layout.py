@@ -33,7 +33,7 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _TITLE, _ROW, _HANDLE = 88, 140, 7  # characters: of a line of the title, a row of the legend, a mark in it
 
 # Rows of a figure in a column, inches: all others are low. A figure above the height of a page is lowered.
-_HEIGHTS = {"cost": 1.7} | dict.fromkeys(("scene", *STRATEGIES), 0.9)
+_HEIGHTS = {"cost": 1.7, "errors": 1.7} | dict.fromkeys(("scene", *STRATEGIES), 0.9)
 _COSTS = 1.6  # of two plans
 _SQUARES = {1: 2.6, 2: 1.5, 3: 2.3}  # by their number in a row
 _SHARES = {1: (1,), 2: (1, 1), 3: (3, 2, 2)}  # of the width

@@ -1,128 +1,152 @@
-"""Simple predictors of a path, fitted to the same recordings as the model: what a calibration has to beat.
+"""Simple predictors of a path, fitted to the same recordings as the model: a calibration has to beat them.
 
-Each predicts the displacement (axes,) of the tip from a step i to a step j of a recording, on each axis from the
-readings up to i and the motions of the guide.
+Each predicts displacements (p, axes) of the tip from steps i (p,) to steps j (p,) of a recording, on each axis from the
+readings up to i and, in the regression, the motions of the guide.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flexneedle.lab.calibration.criteria import steps_ahead
 from flexneedle.lab.calibration.session import Recording
 from flexneedle.types import Floats
 
-Predictor = Callable[[Recording, int, int], Floats]
+Indices = NDArray[np.intp]
+Predictor = Callable[[Recording, Indices, Indices], Floats]
+Pairs = tuple[Indices, Indices]
+"""Steps i and j of predictions of a recording."""
+REGRESSION = "regression"
+"""Name of the predictor that knows the motion of the guide after step i."""
+_RESTS_MM = 0.05
 _DEPTH_SCALE_MM = 50.0
+_LEAST_ADVANCE_MM = 0.5
 
 
-class Pair(NamedTuple):
-    """A prediction: from step i of a recording to step j, `ahead` mm deeper."""
-
-    recording: int
-    i: int
-    j: int
-    ahead: float
+def rests(one: Recording) -> bool:
+    """Return whether the guide rests during an insertion."""
+    return one.guide_moves < _RESTS_MM
 
 
-def pairs_ahead(recordings: Sequence[Recording], ahead: float) -> list[Pair]:
-    """Return pairs of steps whose distance in depth is about `ahead` (mm): the nearest, within a third of it."""
-    found = []
-    for n, one in enumerate(recordings):
-        for i, depth in enumerate(one.depth[:-1].tolist()):
-            j = i + 1 + int(np.argmin(np.abs(one.depth[i + 1 :] - depth - ahead)))
-            if abs(one.depth[j] - depth - ahead) <= ahead / 3.0:
-                found.append(Pair(n, i, j, ahead))
-    return found
+def pairs_ahead(one: Recording, ahead: float) -> Pairs:
+    """Return pairs of steps whose distance in depth is about `ahead` (mm)."""
+    i, j = np.array(steps_ahead(one.depth, ahead), dtype=np.intp).reshape(-1, 2).T
+    return i, j
 
 
-def guide_motion(one: Recording, i: int, j: int) -> float:
-    """Return the largest distance (mm) of the guide, after step i up to step j, from its position at step i."""
-    return float(np.linalg.norm(one.guide[i + 1 : j + 1] - one.guide[i], axis=1).max())
+def whole(one: Recording) -> Pairs:
+    """Return the pair of the first and the last step."""
+    return np.array([0]), np.array([len(one.depth) - 1])
 
 
-def predictors(training: Sequence[Recording], pairs: Sequence[Pair]) -> dict[str, Predictor]:
-    """Return the predictors by name, fitted to pairs of steps of the training recordings."""
-    offset = _axis_offset(training)
-    found = {"straight": _straight(offset), "stays": _stays, "mean path": _mean_path(training)}
-    found["circle"] = _regression(training, pairs, _circle, found["straight"])
-    found["circle, no slope"] = _regression(training, pairs, _circle)
-    found["regression"] = _regression(training, pairs, _guide_moves)
-    return found
+def predictors(training: Sequence[Recording], pairs: Sequence[Pairs]) -> dict[str, Predictor]:
+    """Return the predictors by name, fitted to pairs of steps of each training recording."""
+    straight = _straight(axis_offset(training))
+    return {
+        "straight": straight,
+        "stays": _stay,
+        "circle": _fit(training, pairs, _square, straight),
+        "circle, no slope": _fit(training, pairs, _square, _stay),
+        "mean path": _mean_path(training),
+        REGRESSION: _fit(training, pairs, _guide_moves, _stay),
+    }
 
 
-def _axis_offset(training: Sequence[Recording]) -> Floats:
-    """Return the mean of the sensor's slope less that of the path (axes,), in insertions in which the guide rests."""
+def axis_offset(training: Sequence[Recording]) -> Floats:
+    """Return the median of the sensor's slope less the path's (axes,), in insertions in which the guide rests."""
     gaps = []
     for one in training:
-        rests = (np.abs(np.diff(one.guide, axis=0)) < 0.05).all(axis=1) & (np.diff(one.depth) > 0.5)
-        path = np.diff(one.position, axis=0)[rests] / np.diff(one.depth)[rests, None]
-        gaps.append(0.5 * (one.slope[1:] + one.slope[:-1])[rests] - path)
+        advance = np.diff(one.depth)
+        still = (np.abs(np.diff(one.guide, axis=0)) < _RESTS_MM).all(axis=1) & (advance > _LEAST_ADVANCE_MM)
+        path = np.diff(one.position, axis=0)[still] / advance[still, None]
+        gaps.append(0.5 * (one.slope[1:] + one.slope[:-1])[still] - path)
     every = np.concatenate(gaps)
     every = every[np.isfinite(every).all(axis=1)]
     return np.median(every, axis=0) if len(every) else np.zeros(training[0].axes)
 
 
+def heading(one: Recording, offset: Floats) -> Floats:
+    """Return the slope (k, axes) of the path: of the measured axis, else from the step before, else 0."""
+    advance = np.diff(one.depth)
+    path = np.zeros_like(one.position)
+    forward = advance > _LEAST_ADVANCE_MM
+    path[1:][forward] = np.diff(one.position, axis=0)[forward] / advance[forward, None]
+    return np.nan_to_num(np.where(np.isfinite(one.slope), one.slope - offset, path))
+
+
 def _straight(offset: Floats) -> Predictor:
-    def predict(one: Recording, i: int, j: int) -> Floats:
-        return np.nan_to_num(one.slope[i] - offset) * (one.depth[j] - one.depth[i])
-
-    return predict
-
-
-def _stays(one: Recording, _i: int, _j: int) -> Floats:
-    return np.zeros(one.axes)
-
-
-def _mean_path(training: Sequence[Recording]) -> Predictor:
-    """The mean displacement of the training recordings between the same depths."""
-
-    def at(one: Recording, depth: float) -> Floats:
-        return np.array([np.interp(depth, one.depth, column) for column in one.position.T])
-
-    def predict(one: Recording, i: int, j: int) -> Floats:
-        moved: Floats = np.mean(
-            [at(each, one.depth[j]) - at(each, one.depth[i]) for each in training], axis=0
-        )
+    def predict(one: Recording, i: Indices, j: Indices) -> Floats:
+        moved: Floats = heading(one, offset)[i] * (one.depth[j] - one.depth[i])[:, None]
         return moved
 
     return predict
 
 
-_Features = Callable[[Recording, int, int], Floats]
+def _stay(one: Recording, i: Indices, _j: Indices) -> Floats:
+    return np.zeros((len(i), one.axes))
 
 
-def _circle(one: Recording, i: int, j: int) -> Floats:
-    """Return features (axes, 1): curvature times the square of the advance."""
-    return np.full((one.axes, 1), (one.depth[j] - one.depth[i]) ** 2)
+def _mean_path(training: Sequence[Recording]) -> Predictor:
+    """Return the mean displacement of the training recordings between the same depths, of those that reach them."""
+
+    def predict(one: Recording, i: Indices, j: Indices) -> Floats:
+        moved = np.array([_at(each, one.depth[j]) - _at(each, one.depth[i]) for each in training])
+        known = np.isfinite(moved)
+        total = np.where(known, moved, 0.0).sum(axis=0)
+        mean: Floats = total / np.maximum(known.sum(axis=0), 1)
+        return mean
+
+    return predict
 
 
-def _guide_moves(one: Recording, i: int, j: int) -> Floats:
-    """Return features (axes, 4): advance, slope times advance, motion of the guide, and that times the depth."""
-    length, moved = one.depth[j] - one.depth[i], one.guide[j] - one.guide[i]
-    slope = np.nan_to_num(one.slope[i]) * length
-    return np.stack([np.full(one.axes, length), slope, moved, moved * one.depth[i] / _DEPTH_SCALE_MM], axis=1)
+def _at(one: Recording, depth: Floats) -> Floats:
+    """Return the position (p, axes) at depths, NaN beyond the last; before the first step, the first position."""
+    reached = np.maximum.accumulate(one.depth)
+    limit = reached[-1] + 0.5 * np.median(np.diff(reached)) if len(reached) > 1 else -np.inf
+    at = np.stack([np.interp(depth, reached, column) for column in one.position.T], axis=1)
+    return np.where((depth <= limit)[:, None], at, np.nan)
 
 
-def _regression(
-    training: Sequence[Recording], pairs: Sequence[Pair], features: _Features, known: Predictor = _stays
+Features = Callable[[Recording, Indices, Indices], Floats]
+"""Features (p, axes, f) of pairs of steps."""
+
+
+def _square(one: Recording, i: Indices, j: Indices) -> Floats:
+    """Return the square of the advance, whose coefficient is half of the curvature."""
+    return np.tile((one.depth[j] - one.depth[i])[:, None, None] ** 2, (1, one.axes, 1))
+
+
+def _guide_moves(one: Recording, i: Indices, j: Indices) -> Floats:
+    """Return advance, slope times advance, motion of the guide, and the motion times the depth."""
+    length, moved = (one.depth[j] - one.depth[i])[:, None], one.guide[j] - one.guide[i]
+    slope = heading(one, np.zeros(one.axes))[i] * length
+    depth = one.depth[i][:, None] / _DEPTH_SCALE_MM
+    return np.stack([length + 0.0 * moved, slope, moved, moved * depth], axis=2)
+
+
+def _fit(
+    training: Sequence[Recording], pairs: Sequence[Pairs], features: Features, known: Predictor
 ) -> Predictor:
-    """Return a predictor that adds to a known one what is linear in features (axes, f), on each axis by itself."""
-    rows = [features(training[each.recording], each.i, each.j) for each in pairs]
-    moved = [
-        training[each.recording].position[each.j]
-        - training[each.recording].position[each.i]
-        - known(training[each.recording], each.i, each.j)
-        for each in pairs
-    ]
-    axes = training[0].axes
-    weights = [
-        np.linalg.lstsq(np.array(rows)[:, axis], np.array(moved)[:, axis], rcond=None)[0] for axis in range(axes)
-    ] if rows else [np.zeros(1)] * axes  # fmt: skip
+    """Return a predictor that adds to a known one a linear function of features, on each axis by itself.
 
-    def predict(one: Recording, i: int, j: int) -> Floats:
-        given = features(one, i, j)
-        change: Floats = np.array([given[axis] @ weights[axis] for axis in range(axes)])
+    With fewer pairs than coefficients it adds nothing.
+    """
+    rows = np.concatenate([features(one, *pair) for one, pair in zip(training, pairs, strict=True)])
+    left = np.concatenate(
+        [
+            one.position[pair[1]] - one.position[pair[0]] - known(one, *pair)
+            for one, pair in zip(training, pairs, strict=True)
+        ]
+    )
+    if len(rows) < rows.shape[2]:
+        return known
+    weights = np.stack(
+        [np.linalg.lstsq(rows[:, axis], left[:, axis], rcond=None)[0] for axis in range(left.shape[1])]
+    )
+
+    def predict(one: Recording, i: Indices, j: Indices) -> Floats:
+        change: Floats = np.einsum("paf,af->pa", features(one, i, j), weights)
         return known(one, i, j) + change
 
     return predict

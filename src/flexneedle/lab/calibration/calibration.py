@@ -25,7 +25,7 @@ _OTHER_STARTS = {"stiffness": (np.log(10.0), -np.log(10.0)), "yield": (np.log(0.
 """Further starts of a fit, as changes of a coordinate."""
 _SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
 _READINGS = 0.5  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
-_FIRST_ROUNDS = 2  # until the noise says which criterion to use
+_FIRST_ROUNDS = 2  # until the noise decides on the criterion
 _PROFILED = 1.5  # half-widths of the interval, to either side
 _MOVED = 1e-3  # of the prior's standard deviation
 _ADVICE = {
@@ -121,7 +121,7 @@ class Calibration:
 
     @cached_property
     def problems(self) -> tuple[str, ...]:
-        """Reasons not to trust the fit: not settled, at a bound, not moved, two minima, solves that did not converge."""
+        """Reasons not to trust the fit: not settled or converged, at a bound, not moved, two minima."""
         return tuple(self._find_problems())
 
     def _find_problems(self) -> Iterator[str]:
@@ -132,7 +132,8 @@ class Calibration:
             yield "some steps of the model did not converge"
         for each, interval in zip(self.parameters, self.intervals.values(), strict=True):
             if interval.bound:
-                yield f"{each.label} is at its {interval.bound} bound, {each.value(interval.value):.4g} {each.unit}".rstrip()
+                value = f"{each.value(interval.value):.4g} {each.unit}".rstrip()
+                yield f"{each.label} is at its {interval.bound} bound, {value}"
         size = len(self.parameters)
         if size and (np.abs(point - self.fitted.problem.start)[:size] < _MOVED * sd[:size]).all():
             yield "the fit did not move from its start"
@@ -204,7 +205,8 @@ def calibrate(
 def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
     """Return the fit of the least loss, and those from other starts.
 
-    By the likelihood if predictions have more error from the readings than from what the model lacks; else by their errors.
+    By the likelihood if predictions have more error from the readings than from what the model lacks, else by their
+    errors.
     """
     first = fit(problem, Likelihood, rounds=_FIRST_ROUNDS)
     criterion = Likelihood if reading_share(first) > _READINGS else PredictionErrors

@@ -1,7 +1,7 @@
-"""What a fit minimizes: the likelihood of the readings, or the errors of predictions ahead (docs/theory.md, 13).
+"""Criteria of a fit: the likelihood of the readings, or the errors of predictions ahead (docs/theory.md, 13).
 
-The likelihood uses all readings best if the model lacks nothing. A model that lacks something is better identified by the
-errors of the predictions that it is used for, over the horizon of a controller (Shook, Mohtadi and Shah 1991,
+The likelihood uses all readings best if the model lacks nothing. A model that lacks something is better identified by
+the errors of the predictions that it is used for, over the horizon of a controller (Shook, Mohtadi and Shah 1991,
 doi:10.1049/ip-d.1991.0010). A calibration takes the likelihood if errors of readings are most of what is left.
 """
 
@@ -36,7 +36,7 @@ class Criterion(Protocol):
 
     @property
     def constant(self) -> float:
-        """What the scales of the errors add to the loss."""
+        """Part of the loss by the scales of the errors."""
         ...
 
     def rho(self, squares: Floats) -> Floats:
@@ -69,7 +69,7 @@ class PredictionErrors:
     """Pseudo-Huber loss of the errors of predictions ahead, relative to their root mean square in each class.
 
     Classes are horizons, with and without motions of guide, base or roll.
-    Errors of overlapping predictions are not independent: each has the weight of the share of its advance that is its own.
+    Errors of overlapping predictions are not independent: each has the weight of the advance that is its alone.
     """
 
     rows: list[Floats]
@@ -108,7 +108,7 @@ def root_mean_squares(predictions: Sequence[tuple[Floats, Floats]], residuals: S
 def predict_ahead(path: Whitened, noise: Noise, reached: float) -> tuple[Floats, Floats]:
     """Return predictions of positions from all readings up to a step: rows (a, r) of their errors, classes (a,).
 
-    The errors that an insertion has as a whole are not estimated from its first steps: the parameters have to give them.
+    Errors that an insertion has as a whole are not estimated from its first steps: the parameters have to give them.
     """
     covariance = path.covariance(noise.without(GAIN_KINDS))
     depth, moved = path.deviations.depth, path.deviations.moved

@@ -4,7 +4,7 @@ On an axis the deviation at step i is (e, ξ): distance (mm) and heading (rad). 
 
     e ← e + ξ dx + a,    ξ ← ξ + b,
 
-with independent disturbances (a, b) in each interval. They have variances that are to be estimated, of
+with independent disturbances (a, b) in each interval. Their variances are estimated, of
 
     heading     a random walk of the heading, per mm of advance
     lateral     a random walk across the path, per mm of advance
@@ -20,11 +20,11 @@ degrees of freedom, whose expectation follows from the data (West 1984, doi:10.1
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from flexneedle.types import Flags, Floats
@@ -132,26 +132,30 @@ class Deviations:
 
         factors (k,): on the variances of each interval.
         """
-        size, (u, v) = len(self.depth), self.predicted
-        blocks = self.blocks * factors
-        x = self.depth - self.depth[0]
-        whole = np.stack([np.append(0.5 * x * x, x), self.effect @ np.append(u, v)])
-        parts = [self._spread(block) for block in blocks]
-        parts += [np.outer(each, each) for each in whole]
+        size = len(self.depth)
+        parts = [self.spread(block) for block in self.blocks * factors]
+        parts += [np.outer(each, each) for each in self.whole]
         parts += [np.diag(np.repeat(each, size)) for each in ((1.0, 0.0), (0.0, 1.0))]
         return np.array(parts)
 
-    def _spread(self, block: Floats) -> Floats:
+    @cached_property
+    def whole(self) -> Floats:
+        """Effects (2, 2 k) on e, then ξ, of the errors that the insertion has as a whole, for values of 1."""
+        x = self.depth - self.depth[0]
+        return np.stack([np.append(0.5 * x * x, x), self.effect @ self.predicted.ravel()])
+
+    def spread(self, block: Floats) -> Floats:
         """Return the covariance (2 k, 2 k) at all steps of disturbances with covariances (2, 2, k)."""
-        size = len(self.depth)
-        left = self.effect.reshape(-1, 2, size)
-        return np.einsum("pik,ijk,qjk->pq", left, block, left, optimize=True)
+        left = self.effect.reshape(-1, 2, len(self.depth))
+        weighed = np.einsum("pik,ijk->pjk", left, block)
+        found: Floats = weighed.reshape(len(left), -1) @ left.reshape(len(left), -1).T
+        return found
 
     @cached_property
     def start(self) -> Floats:
         """Covariance (2 k, 2 k) of an unknown start."""
         size = len(self.depth)
-        return self._spread(np.einsum("ij,k->ijk", np.diag(_START**2), np.eye(size)[0]))
+        return self.spread(np.einsum("ij,k->ijk", np.diag(_START**2), np.eye(size)[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,35 +183,31 @@ class Whitened:
 
     def covariance(self, noise: Noise) -> Floats:
         """Return the covariance (r, r) of the residuals."""
-        return self.start + np.tensordot(noise.sd**2, self.parts, 1)
+        readings = np.repeat(noise.sd[-2:] ** 2, len(self.deviations.depth))[self.known]
+        found: Floats = self.latent(noise)[self.known][:, self.known] + np.diag(readings)
+        return found
 
     def latent(self, noise: Noise) -> Floats:
         """Return the covariance (2 k, 2 k) of the deviations themselves, without errors of readings."""
-        units = self.deviations.unit_covariances(self.factors)[:-2]
-        return self.deviations.start + np.tensordot(noise.sd[:-2] ** 2, units, 1)
+        deviations, variance = self.deviations, noise.sd**2
+        block = np.tensordot(variance[:_INTERVALS], deviations.blocks, 1) * self.factors
+        whole = np.sqrt(variance[_INTERVALS:-2, None]) * deviations.whole
+        return deviations.start + deviations.spread(block) + whole.T @ whole
 
     def with_factors_for(self, noise: Noise, residuals: Floats) -> "Whitened":
         """Return the same with the expected factors of the intervals, given the residuals (r,)."""
-        deviations, size = self.deviations, len(self.deviations.depth)
-        unit = np.einsum("b,bijk->kij", noise.sd[:_INTERVALS] ** 2, deviations.blocks[..., 1:])
+        deviations, factors = self.deviations, self.factors[1:]
+        unit = np.tensordot(noise.sd[:_INTERVALS] ** 2, deviations.blocks[..., 1:], 1)
+        effect = deviations.effect.reshape(len(self.known), 2, -1)[self.known, :, 1:]
         solved = cho_factor(self.covariance(noise), lower=True)
-        weighed = cho_solve(solved, residuals)
-        effect = deviations.effect[self.known].reshape(-1, 2, size)[:, :, 1:]
-        prior = unit * self.factors[1:, None, None]
-        carried = np.einsum(
-            "kij,pjk->kip", prior, effect
-        )  # covariance of each disturbance with the residuals
-        mean = carried @ weighed
-        left = prior - np.einsum(
-            "kip,pkj->kij",
-            carried,
-            cho_solve(solved, carried.transpose(2, 0, 1).reshape(len(residuals), -1)).reshape(
-                len(residuals), size - 1, 2
-            ),
+        pull = np.tensordot(cho_solve(solved, residuals), effect, 1)
+        root = solve_triangular(solved[0], effect.reshape(len(residuals), -1), lower=True).reshape(
+            effect.shape
         )
-        squared = np.linalg.solve(unit, left + mean[:, :, None] * mean[:, None, :])
-        distance = np.trace(squared, axis1=1, axis2=2)
-        return Whitened(deviations, self.known, np.append(1.0, (TAIL + distance) / (TAIL + 2.0)))
+        excess = np.einsum("pik,pjk->ijk", root, root) - pull[:, None] * pull
+        # The expected squared distance of a disturbance from 0, of 2 in the mean.
+        distance = factors * (2.0 - factors * np.einsum("ijk,ijk->k", excess, unit))
+        return replace(self, factors=np.append(1.0, (TAIL + distance) / (TAIL + 2.0)))
 
 
 def estimate_noise(paths: Sequence[Whitened], residuals: Sequence[Floats], first: Noise) -> Noise:

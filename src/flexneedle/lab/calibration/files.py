@@ -22,7 +22,8 @@ def record_path(scenario: Path) -> Path:
 def write_calibration(found: Calibration, path: Path, source: str) -> None:
     """Write the calibrated scenario, and the record beside it. source: the scenario from which the fit started."""
     lines = [
-        f"# Calibrated from {source} with {len(found.session.recordings)} recorded insertions: {', '.join(found.session.names)}."
+        f"# Calibrated from {source} with {len(found.session.recordings)} recorded insertions of "
+        f"{', '.join(found.session.names)}."
     ]
     lines += [f"# {label}: {value} (95 %: {interval})" for label, value, interval in found.table()]
     if found.scenario.setup.axes == 2:
@@ -64,11 +65,11 @@ def read_record(scenario: Path) -> dict[str, Any] | None:
     """Return the record beside a scenario, None if there is none. Raises InputError for another format."""
     path = record_path(scenario)
     try:
-        record: dict[str, Any] = json.loads(path.read_text())
+        record: Any = json.loads(path.read_text())
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
         raise InputError(f"{path}: not a record of this version: format must be {_FORMAT}")
-    return record
+    return dict(record)

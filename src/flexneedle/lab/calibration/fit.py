@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -12,7 +13,7 @@ from flexneedle.lab.calibration.deviations import KINDS, Deviations, Noise, Whit
 from flexneedle.lab.calibration.parameters import Parameter, make_needle, trial_of
 from flexneedle.lab.calibration.prediction import Replay
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats
+from flexneedle.types import Flags, Floats
 
 _ROUNDS = 10  # of parameters, noise and weights
 _SETTLED = 0.1  # change of a parameter, in standard deviations, at which the rounds end
@@ -25,8 +26,8 @@ _FAR = 20.0  # standard deviations, to the bounds of axis and lever
 class Problem:
     """A fit: scenario, parameters, recordings.
 
-    The point of a fit has the p parameters, then for each session the slope (rad) of the sensor's axis on each axis, and
-    the lever of the sensor (mm): its distance from the point whose path the model predicts, along the needle.
+    The point of a fit has the p parameters, then for each session the slope (rad) of the sensor's axis on each axis,
+    and the lever of the sensor (mm): its distance from the point whose path the model predicts, along the needle.
     """
 
     scenario: Scenario
@@ -60,7 +61,7 @@ class Problem:
         low = np.append([each.low for each in self.parameters], -far)
         return np.stack([low, np.append([each.high for each in self.parameters], far)])
 
-    def tips(self, points: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def tips(self, points: Sequence[Floats]) -> tuple[Floats, Flags]:
         """Return the tips (v, n, k, 5) at points, and whether all solves converged (v, n)."""
         trials = [trial_of(self.scenario, self.parameters, point[: len(self.parameters)]) for point in points]
         return self.replay.predict([make_needle(self.scenario, trial) for trial in trials])
@@ -76,8 +77,7 @@ class Problem:
 class Residuals:
     """Residuals of all recordings at a point on all axes, with their derivatives.
 
-    values: (r,) for each recording and axis; slopes: (r, p + s); models: predicted readings (2 k,), for each of them, too;
-    tips (n, k, 5).
+    values: (r,) for each recording and axis; slopes: (r, p + s); models: predicted readings (2 k,); tips (n, k, 5).
     """
 
     values: list[Floats]
@@ -127,8 +127,8 @@ def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
         count = len(one.depth)
         for axis in range(problem.replay.axes):
             known = np.isfinite(np.append(one.position[:, axis], one.slope[:, axis]))
-            path = tips[n, :count, [1 + axis, 3 + axis]]
-            deviations = Deviations(one.depth, *path, one.moved)
+            y, slope = tips[n, :count, [1 + axis, 3 + axis]]
+            deviations = Deviations(one.depth, y, slope, one.moved)
             paths.append(Whitened(deviations, known, np.ones(count)))
     return paths
 
@@ -149,7 +149,7 @@ class Fitted:
     cost: float
     errors: Floats
     slopes: Floats
-    groups: Floats
+    groups: Any
     residuals: Residuals
     settled: bool
 
@@ -161,14 +161,15 @@ class Fitted:
 
     @cached_property
     def without(self) -> Floats:
-        """Points (n, p + s) without one recording each: one step of Gauss–Newton from that of all."""
+        """Points (n, p + s) without one recording each: one step of Gauss–Newton from the point."""
         gradient = self.slopes.T @ self.errors + (self.problem.start - self.point) / self.problem.sd**2
         moves = []
         for n in range(len(self.problem.replay.recordings)):
             rows = self.groups == n
             less = self.information - self.slopes[rows].T @ self.slopes[rows]
             moves.append(np.linalg.solve(less, gradient - self.slopes[rows].T @ self.errors[rows]))
-        return self.point + np.array(moves)
+        found: Floats = self.point + np.array(moves)
+        return found
 
 
 def fit(

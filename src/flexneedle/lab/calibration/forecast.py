@@ -8,67 +8,68 @@ from scipy.linalg import cho_factor, cho_solve
 
 from flexneedle.lab.calibration.deviations import TAIL, Noise, Whitened
 from flexneedle.lab.calibration.fit import Fitted, paths_at, residuals_at
+from flexneedle.lab.calibration.prediction import Replay
+from flexneedle.lab.calibration.session import Session
 from flexneedle.types import Floats
+
+_UNKNOWN = TAIL / (TAIL - 2.0)  # mean of the prior of a factor
 
 
 class Forecast(NamedTuple):
-    """Positions (k, k, axes) predicted at steps j from the readings up to step i, and standard deviations (mm).
+    """Positions (k, k, axes) in mm predicted at steps j from the readings up to step i, and their standard deviations.
 
-    Those of steps up to i are estimates. The standard deviations are of a reading.
+    Positions up to i are estimates. The standard deviations include the error of a reading. model, slope (k, axes): the
+    model's own position, and slope (rad) of the sensor's axis, at each step.
     """
 
     position: Floats
     sd: Floats
+    model: Floats
+    slope: Floats
 
 
-def forecast(fitted: Fitted) -> list[Forecast]:
-    """Return the forecasts of the recordings of a fit, with its point and noise."""
-    problem, point = fitted.problem, fitted.point
-    found = residuals_at(problem, point, derivatives=False)
-    paths, axes = paths_at(problem, found.tips), problem.replay.axes
+def forecast(fitted: Fitted, session: Session) -> list[Forecast]:
+    """Return the forecasts of other insertions of the sessions of a fit, with its point and noise."""
+    problem = replace(fitted.problem, replay=Replay.of(session))
+    tips = residuals_at(problem, fitted.point, derivatives=False).tips
+    problem = replace(problem, replay=problem.replay.corrected(tips))
+    found = residuals_at(problem, fitted.point, derivatives=False)
+    paths, axes = paths_at(problem, found.tips), session.axes
     forecasts = []
-    for n, one in enumerate(problem.replay.recordings):
-        count = len(one.depth)
-        both = [
-            _on_axis(paths[axes * n + axis], fitted.noise, found.values[axes * n + axis])
-            for axis in range(axes)
-        ]
-        model = np.stack([found.models[axes * n + axis][:count] for axis in range(axes)], axis=1)
-        mean = np.stack([expected for expected, _ in both], axis=2) + model
-        forecasts.append(Forecast(mean, np.stack([sd for _, sd in both], axis=2)))
+    for n in range(len(session.recordings)):
+        own = range(axes * n, axes * n + axes)
+        both = [expect_deviations(paths[k], fitted.noise, found.values[k]) for k in own]
+        expected, sd = np.moveaxis(np.array(both), 0, -1)
+        model = np.array([found.models[k].reshape(2, -1) for k in own])
+        positions, slopes = np.moveaxis(model, 1, 0).swapaxes(1, 2)
+        forecasts.append(Forecast(expected + positions, sd, positions, slopes))
     return forecasts
 
 
-def _on_axis(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, Floats]:
+def expect_deviations(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, Floats]:
     """Return expected deviations (k, k) of the position on an axis, and standard deviations, after each step."""
     count = len(path.deviations.depth)
-    steps = np.tile(np.arange(count), 2)[path.known]
+    step, factors = np.arange(count), np.full(count, _UNKNOWN)
     expected, sd = np.empty((count, count)), np.empty((count, count))
-    factors = np.ones(count)
+    values = np.zeros(2 * count)
+    values[path.known] = residuals
     for i in range(count):
-        # Factors of intervals that are over follow from the data; later ones have the mean of their prior.
-        ahead = np.where(np.arange(count) <= i, factors, TAIL / (TAIL - 2.0))
-        known = steps <= i
-        now = replace(path, factors=ahead)
-        covariance = now.covariance(noise)[np.ix_(known, known)]
-        latent = now.latent(noise)
-        across = latent[:count][:, path.known][:, known]
-        solved = cho_factor(covariance, lower=True)
-        expected[i] = across @ cho_solve(solved, residuals[known])
-        variance = np.diag(latent)[:count] - np.einsum("ij,ji->i", across, cho_solve(solved, across.T))
+        now = replace(path, known=np.logical_and(path.known, np.tile(step, 2) <= i), factors=factors)
+        expected[i], variance = _predict(now, noise, values[now.known])
         sd[i] = np.sqrt(np.maximum(variance, 0.0) + noise.sd[-2] ** 2)
-        factors = _factors(path, noise, residuals, known, i, factors)
+        if i > 0 and now.known.any():
+            # Factors of intervals that are over follow from the data; later ones keep the mean of their prior.
+            found = now.with_factors_for(noise, values[now.known]).factors
+            factors = np.where(step <= i, found, _UNKNOWN)
     return expected, sd
 
 
-def _factors(
-    path: Whitened, noise: Noise, residuals: Floats, known: Floats, i: int, factors: Floats
-) -> Floats:
-    """Return the factors of the intervals up to step i, from the residuals up to there."""
-    if i == 0:
-        return factors
-    seen = np.zeros(len(path.known), dtype=bool)
-    seen[np.flatnonzero(path.known)[known]] = True
-    part = replace(path, known=seen, factors=np.where(np.arange(len(factors)) <= i, factors, 1.0))
-    new = part.with_factors_for(noise, residuals[known]).factors
-    return np.where(np.arange(len(factors)) <= i, new, 1.0)
+def _predict(path: Whitened, noise: Noise, residuals: Floats) -> tuple[Floats, Floats]:
+    """Return expected deviations (k,) of the position at all steps given residuals (r,), and their variances."""
+    latent = path.latent(noise)[: len(path.deviations.depth)]
+    if not path.known.any():
+        return np.zeros(len(latent)), np.diag(latent)
+    across = latent[:, path.known]
+    solved = cho_factor(path.covariance(noise), lower=True)
+    variance = np.diag(latent) - np.einsum("ij,ji->i", across, cho_solve(solved, across.T))
+    return across @ cho_solve(solved, residuals), variance

@@ -31,7 +31,7 @@ class Interval:
 def jackknife(fitted: Fitted) -> Floats:
     """Return the covariance (p + s, p + s) of the point by leaving out one recording at a time.
 
-    Each point without a recording is one Gauss–Newton step from that of all, in which the prior keeps its weight
+    Each point without a recording is one Gauss–Newton step from the point of all, in which the prior keeps its weight
     (Efron and Stein 1981, doi:10.1214/aos/1176345462).
     """
     moved = fitted.without
@@ -43,8 +43,8 @@ def jackknife(fitted: Fitted) -> Floats:
 def intervals(fitted: Fitted) -> list[Interval]:
     """Return the parameters of a fit with their intervals of 95 %.
 
-    The variance is the sum of those by the information of data and prior and by jackknife, with Student's t: on synthetic
-    insertions each alone covers 70 to 90 % (studies/calibration.py).
+    The variance is the sum of those by the information of data and prior and by jackknife, with Student's t: on
+    synthetic insertions each alone covers 70 to 90 % (studies/calibration.py).
     """
     problem, size = fitted.problem, len(fitted.problem.parameters)
     recordings = len(problem.replay.recordings)
@@ -62,9 +62,9 @@ def intervals(fitted: Fitted) -> list[Interval]:
 
 
 def _is_identified(fitted: Fitted, k: int, width: float) -> bool:
-    """Return whether an interval is narrow enough to be useful, and, of a stiffness, no value a factor 4 away fits as well.
+    """Return whether an interval is useful, and, of a stiffness, no value a factor 4 away fits as well.
 
-    The prior of a length is a measurement of it; that of a stiffness or a bevel is so wide that it says nothing.
+    The prior of a length is a measurement of it; a stiffness and a bevel have very wide priors.
     """
     parameter = fitted.problem.parameters[k]
     if width > parameter.useful:

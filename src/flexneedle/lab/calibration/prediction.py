@@ -3,15 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from flexneedle.lab.calibration.parameters import Needle
 from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import DB_X, DB_Y, DG_Y, Floats
+from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Flags, Floats
 
-_AIR_MM = 1.0  # the model starts at least so far before the skin, and behind the first step
+_AIR_MM = 1.0  # from the start of the model to the skin, and to the first step, at least
 _LONGEST_MM = 1.0  # advance in a step of the model
 
 
@@ -53,7 +54,7 @@ class Replay:
 
     @cached_property
     def commands(self) -> Floats:
-        """Commands (n, m, 9): for each step `_parts` of the advance, and a motion of guide and base before or after."""
+        """Commands (n, m, 9): for each step a roll, `_parts` of the advance, and a motion of guide and base."""
         steps, width = max(len(depth) for depth in self.depths), self._parts + 2
         rows = np.zeros((len(self.recordings), steps, width, 9))
         at = {"before": slice(0, 1), "with": slice(1, -1), "after": slice(-1, None)}[self.guide_order]
@@ -64,27 +65,30 @@ class Replay:
                 change = np.diff(moved, axis=0, prepend=moved[:1])
                 for axis in range(self.axes):
                     row[:size, at, column + axis] = change[:, axis, None] / row[:size, at].shape[1]
+            row[:size, 0, ROLL] = np.diff(one.roll, prepend=one.roll[:1])
         return rows.reshape(len(rows), -1, 9)
 
     @cached_property
-    def _ends(self) -> Floats:
+    def _ends(self) -> Any:
         width = self._parts + 2
         return np.arange(width - 1, self.commands.shape[1], width)
 
-    def predict(self, needles: Sequence[Needle]) -> tuple[Floats, Floats]:
+    def predict(self, needles: Sequence[Needle]) -> tuple[Floats, Flags]:
         """Return tips (v, n, k, 5) by each of v needles at the steps of n recordings, and whether all solves converged.
 
-        Those of recordings with fewer than k steps repeat their last.
+        Recordings with fewer than k steps repeat their last tip.
         """
         states, models = [], []
         zero = (0.0,) * self.axes
         for needle in needles:
-            states += [needle.simulator.start(needle.roll, (self.begin, *zero), zero)] * len(self.order)
+            rolls = [needle.roll + float(one.roll[0]) for one in self.recordings]
+            starts = {roll: needle.simulator.start(roll, (self.begin, *zero), zero) for roll in set(rolls)}
+            states += [starts[roll] for roll in rolls]
             models += [needle.model(order) for order in self.order]
         rows = np.tile(self.commands, (len(needles), 1, 1))
         out = needles[0].simulator.rollout(states, rows, models=models, limits=False)
         shape = len(needles), len(self.recordings), len(self._ends)
-        good: Floats = out.converged.reshape(*shape[:2], -1).all(axis=2)
+        good = np.logical_and.reduce(np.asarray(out.converged).reshape(*shape[:2], -1), axis=2)
         return out.tips[:, self._ends].reshape(*shape, 5), good
 
     def corrected(self, tips: Floats) -> "Replay":

@@ -84,11 +84,13 @@ class Session:
         recordings: The insertions.
         guide_order: When the guide moves between two steps.
         origin: Where the recordings are from: sources, frame, and what was found on import.
+        places: Place of each insertion among all of its session, from 0, where these are a selection.
     """
 
     recordings: tuple[Recording, ...]
     guide_order: GuideOrder = "before"
     origin: Mapping[str, Any] = field(default_factory=dict)
+    places: tuple[int, ...] | None = None
 
     @property
     def axes(self) -> int:
@@ -100,9 +102,14 @@ class Session:
         """Names of the sessions."""
         return tuple(dict.fromkeys(one.session for one in self.recordings))
 
-    @cached_property
+    @property
     def order(self) -> tuple[int, ...]:
-        """Place of each insertion within its session, from 0."""
+        """Place of each insertion within its session, from 0, also after a selection."""
+        return self._ranks if self.places is None else self.places
+
+    @cached_property
+    def _ranks(self) -> tuple[int, ...]:
+        """Place of each insertion among these of its session, from 0."""
         counts = dict.fromkeys(self.names, 0)
         places = []
         for one in self.recordings:
@@ -113,12 +120,12 @@ class Session:
     @property
     def even(self) -> "Session":
         """The first, third, … insertion of each session."""
-        return self.select([place % 2 == 0 for place in self.order])
+        return self.select([place % 2 == 0 for place in self._ranks])
 
     @property
     def odd(self) -> "Session":
         """The second, fourth, … insertion of each session."""
-        return self.select([place % 2 == 1 for place in self.order])
+        return self.select([place % 2 == 1 for place in self._ranks])
 
     def of(self, name: str) -> "Session":
         """Return one of the sessions. Raises InputError for another name."""
@@ -128,8 +135,9 @@ class Session:
 
     def select(self, chosen: Sequence[bool]) -> "Session":
         """Return the insertions that are chosen."""
-        kept = tuple(one for one, keep in zip(self.recordings, chosen, strict=True) if keep)
-        return replace(self, recordings=kept)
+        kept = [n for n, keep in zip(range(len(self.recordings)), chosen, strict=True) if keep]
+        places = tuple(self.order[n] for n in kept)
+        return replace(self, recordings=tuple(self.recordings[n] for n in kept), places=places)
 
     def __repr__(self) -> str:
         steps = sum(len(one.depth) for one in self.recordings)

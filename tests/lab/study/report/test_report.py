@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.study.report.page import embed_figure
+from flexneedle.lab.html.page import embed_figure
 from flexneedle.lab.study.report.report import write_report
 from report_page import Page, save_nothing
 from study_rows import OURS, make_rows, unfinished, write_study
@@ -98,7 +98,7 @@ def test_figures_in_the_page_are_those_in_the_folder(plain, monkeypatch):
     inside = [base64.b64decode(image["src"].split(",")[1]) for image in page.all("img")]
     assert inside == [drawn.svg.read_bytes() for drawn in report.figures]
     assert all(ElementTree.fromstring(data).tag.endswith("svg") for data in inside)
-    monkeypatch.setattr("flexneedle.lab.study.report.page._LARGEST_SVG", 1000)
+    monkeypatch.setattr("flexneedle.lab.html.page._LARGEST_SVG", 1000)
     large = embed_figure(report.figures[0]).removeprefix("data:image/png;base64,")
     assert base64.b64decode(large) == report.figures[0].png.read_bytes()
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from flexneedle.figures.layout import Floats, Look, look
 from flexneedle.figures.style import INK, save
+from flexneedle.lab.html.page import ReportFigure
 from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
 from flexneedle.lab.study.figures.distributions import draw_errors
 from flexneedle.lab.study.figures.front import FrontSample, draw_front
@@ -32,18 +33,6 @@ if TYPE_CHECKING:
 
 _MOST_LEVELS = 40  # of an axis in a figure
 _LOGARITHMIC = "Errors are on a logarithmic scale."
-
-
-@dataclass(frozen=True)
-class ReportFigure:
-    """A figure on disk with title and caption; alt: caption with the notes of the panels."""
-
-    name: str
-    title: str
-    caption: str
-    alt: str
-    png: Path
-    svg: Path
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,10 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
+from flexneedle.lab.html.page import ReportFigure
 from flexneedle.lab.study.findings.findings import Findings, compute_findings
 from flexneedle.lab.study.findings.reading import read_study_folder
-from flexneedle.lab.study.report.figures import ReportFigure, draw_figures
+from flexneedle.lab.study.report.figures import draw_figures
 from flexneedle.lab.study.report.page import render_page
 
 REPORT_FILE = "report.html"

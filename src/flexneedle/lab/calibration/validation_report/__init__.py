@@ -1,0 +1,1 @@
+"""Report on a validation: figures and an HTML page."""
