@@ -1,4 +1,4 @@
-"""A simulated laboratory: a gel 16 times as stiff as in mine.toml, a guide 2 mm closer, and five recorded insertions."""
+"""A simulated laboratory: a gel 16 times as stiff as in mine.toml, a guide 2 mm closer, five recorded insertions."""
 
 import csv
 import math

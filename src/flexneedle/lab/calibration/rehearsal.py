@@ -1,4 +1,4 @@
-"""Rehearsals: recordings of a simulated phantom, to try import, calibration and validation before those of a laboratory."""
+"""Rehearsals: recordings of a simulated phantom, to try a calibration before a laboratory's own."""
 
 import math
 from collections.abc import Sequence
