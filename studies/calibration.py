@@ -1,16 +1,17 @@
 """Calibration on simulated phantoms: accuracy of fits, and closed loops with and without one.
 
-    python studies/calibration.py sets|loops [--first N] [--count N] [--jobs N] [--kind KIND] [--fit NAME ...]
-        [--out FILE]
+    python studies/calibration.py sets|loops [--first N] [--count N] [--jobs N] [--kind KIND] [--same-bevel]
+        [--fit NAME ...] [--out FILE]
 
 sets: a random world with a guide, `world:N` and `wide:N` alternately, is the scenario of a fit. The true stiffness is
 1/4 to 4 times the scenario's, the bevel offset 0.5 to 1.5 times, the clearance 0 to 0.1 mm; the plant is exact. Five
 insertions with moves of the guide are recorded and fitted. A sixth, recorded without errors, is predicted with the
 fitted and with the true values.
 
-loops: the true stiffness is 10 to 100 times the scenario's, on a phantom with all imperfections of the world. Three
-insertions are recorded. The default controller then steers on this phantom with the scenario as it is, and with the
-calibrated one; each has its own plan.
+loops: the true stiffness is 10 to 100 times the scenario's, on a phantom with all imperfections of the world. The
+bevel offset is smaller by this factor to the power of 3/4, so that the free path has the scenario's curvature; with
+--same-bevel it is the scenario's, and many needles curl. Three insertions are recorded. The default controller then
+steers on this phantom with the scenario as it is, and with the calibrated one; each has its own plan.
 
 A summary is printed on stdout. FILE gets a row for each number as a line of JSON when it has finished; a second run
 skips the numbers in FILE.
@@ -46,16 +47,18 @@ from flexneedle.scenario.worlds import world
 
 FIRST_WORLD, WORLDS_APART = 100_000, 100
 STEPS, TRAVEL_MM = 20, 3.0
+CURVATURE_POWER = 0.75  # of the stiffness in the curvature of a path (docs/theory.md eq. 10)
 FIT = ("stiffness", "bevel", "clearance")
 INTERVALS = {"stiffness": "stiffness of", "bevel": "bevel"}  # labels of the parameters that are judged
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What to fit, in which worlds (kind: both alternately if None)."""
+    """What to fit, in which worlds (kind: both alternately if None), and the bevel of closed loops."""
 
     fit: tuple[str, ...]
     kind: str | None = None
+    same_bevel: bool = False
 
 
 def guided_world(number: int, kind: str | None) -> Scenario:
@@ -132,7 +135,8 @@ def close_loop(number: int, choice: Choice) -> dict[str, Any]:
     scenario = guided_world(number, choice.kind)
     factor = float(10.0 ** rng.uniform(1.0, 2.0))
     known = scenario.with_values({"phantom.shear_modulus_factor": [1.0, 1.0]})
-    phantom = draw(with_true_values(known, factor, 1.0, scenario.phantom.guide_clearance_mm), rng)
+    bevel = 1.0 if choice.same_bevel else factor**-CURVATURE_POWER
+    phantom = draw(with_true_values(known, factor, bevel, scenario.phantom.guide_clearance_mm), rng)
     found = calibrate(scenario, Rehearsal(phantom, rng).record(draw_schedules(scenario, 3, rng)), choice.fit)
     row = judge(found, {"stiffness": float(np.log(factor)), "bevel": phantom.scenario.needle.bevel.offset_mm})
     return {
@@ -250,6 +254,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--count", type=int, metavar="N", help="numbers (default: 100 sets, 50 loops)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N")
     parser.add_argument("--kind", choices=WORLD_KINDS, help="kind of world (default: both alternately)")
+    parser.add_argument("--same-bevel", action="store_true", help="loops: keep the scenario's bevel offset")
     parser.add_argument("--fit", nargs="+", metavar="NAME", default=FIT, help=f"default: {' '.join(FIT)}")
     parser.add_argument("--out", type=Path, metavar="FILE", help="rows as lines of JSON")
     return parser.parse_args(argv)
@@ -262,7 +267,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     wanted = range(args.first, args.first + (args.count or most))
     rows = [row for row in read_rows(args.out) if row["number"] in wanted]
     left = set(wanted) - {row["number"] for row in rows}
-    for row in run_all(args.part, sorted(left), Choice(tuple(args.fit), args.kind), args.jobs):
+    for row in run_all(
+        args.part, sorted(left), Choice(tuple(args.fit), args.kind, args.same_bevel), args.jobs
+    ):
         rows.append(row)
         print(f"{len(rows)}/{len(wanted)}: {json.dumps(row)}", file=sys.stderr, flush=True)
         if args.out is not None:
