@@ -54,7 +54,7 @@ INTERVALS = {"stiffness": "stiffness of", "bevel": "bevel"}  # labels of the par
 
 @dataclass(frozen=True)
 class Choice:
-    """What to fit, in which worlds (kind: both alternately if None), and the bevel of closed loops."""
+    """Fitted parameters, kind of worlds (None: both alternately), and whether loops keep the bevel offset."""
 
     fit: tuple[str, ...]
     kind: str | None = None

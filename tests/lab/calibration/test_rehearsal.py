@@ -10,7 +10,7 @@ from flexneedle.lab.calibration.parameters import make_needle, parameters_of, tr
 from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
 from flexneedle.lab.calibration.rehearsal import Rehearsal, Schedule, SensorErrors, carry_out
 from flexneedle.phantom.draw import Truth
-from flexneedle.phantom.plants import ModelPlant
+from flexneedle.phantom.plants import ExactPlant, ModelPlant
 from flexneedle.types import DB_X, DG_Y, DG_Z
 
 EXACT = SensorErrors(0.0, 0.0)
@@ -93,8 +93,8 @@ def test_readings_have_the_errors_of_the_sensor():
 
 def test_a_slope_is_the_tangent_of_the_angle_of_the_tip():
     plan = Schedule(np.zeros(1), np.zeros((1, 1)))
-    tilted = SimpleNamespace(step=lambda row: None, tip=np.array([0.0, 0.0, 0.0, 0.4, 0.0]))
-    (one,) = rehearse(GEL, plan, plant=lambda truth, roll: tilted).recordings
+    tilted = SimpleNamespace(step=lambda _: None, tip=np.array([0.0, 0.0, 0.0, 0.4, 0.0]))
+    (one,) = rehearse(GEL, plan, plant=lambda *_: tilted).recordings
     assert one.slope[0, 0] == pytest.approx(np.tan(0.4))
 
 
@@ -118,5 +118,5 @@ def test_a_session_has_its_insertions_in_order_and_repeats_with_its_seed():
 
 
 def test_the_exact_plant_carries_out_a_schedule_to_its_depth():
-    (one,) = rehearse(GEL, Rehearsal.__dataclass_fields__["plant"].default and schedule(1)).recordings
+    (one,) = rehearse(GEL, plant=ExactPlant).recordings
     assert one.depth[-1] == pytest.approx(60.0, abs=0.5)

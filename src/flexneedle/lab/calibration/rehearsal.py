@@ -87,7 +87,7 @@ class Rehearsal:
         return Recording(
             session,
             name,
-            time=_STEP_S * np.arange(count),
+            time=_STEP_S * np.arange(count, dtype=float),
             depth=points[:, 0],
             position=points[:, 1:] - points[0, 1:],
             slope=slope + self.rng.normal(0.0, self.errors.slope, (count, axes)),
