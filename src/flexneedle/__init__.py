@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     )
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.estimation.task import Task
+    from flexneedle.lab.calibration.calibration import calibrate
+    from flexneedle.lab.calibration.session import load_session
+    from flexneedle.lab.calibration.validation import validate
     from flexneedle.lab.study.runner import run_study
     from flexneedle.loop.events import Decided, Ended, Gate, PeriodEnded, Planned
     from flexneedle.loop.insertions import insert
@@ -126,16 +129,19 @@ __all__ = [
     "Y",
     "Z",
     "__version__",
+    "calibrate",
     "controls",
     "insert",
     "load",
     "load_scenario",
+    "load_session",
     "plan",
     "plot",
     "run_study",
     "save",
     "to_dataframe",
     "travel_left",
+    "validate",
 ]
 
 _HOMES = {
@@ -145,6 +151,9 @@ _HOMES = {
     "StateError StoppedError",
     "estimation.estimate": "Estimate",
     "estimation.task": "Task",
+    "lab.calibration.calibration": "calibrate",
+    "lab.calibration.session": "load_session",
+    "lab.calibration.validation": "validate",
     "lab.study.runner": "run_study",
     "loop.events": "Decided Ended Gate PeriodEnded Planned",
     "loop.insertions": "insert",

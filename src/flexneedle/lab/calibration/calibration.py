@@ -234,7 +234,7 @@ def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
     found: dict[str, Interval] = {}
     while True:
         labels = [each.label for each in fitted.problem.parameters]
-        now = dict(zip(labels, intervals(fitted), strict=True))
+        now = dict(zip(labels, intervals(fitted, check_far=not found), strict=True))
         open_ones = [label for label in labels if label not in found and not now[label].identified]
         if not open_ones:
             return fitted, now | found

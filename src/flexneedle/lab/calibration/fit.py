@@ -262,8 +262,8 @@ def _least_squares(problem: Problem, criterion: Criterion, start: Floats) -> tup
         bounds=(low, high),
         loss=rho,
         x_scale="jac",
-        xtol=1e-4,
-        ftol=1e-6,
+        xtol=1e-3,
+        ftol=1e-4,
         max_nfev=12,
     )
     return found.x, at(found.x)

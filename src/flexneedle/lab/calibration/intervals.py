@@ -40,8 +40,8 @@ def jackknife(fitted: Fitted) -> Floats:
     return covariance
 
 
-def intervals(fitted: Fitted) -> list[Interval]:
-    """Return the parameters of a fit with their intervals of 95 %.
+def intervals(fitted: Fitted, *, check_far: bool = True) -> list[Interval]:
+    """Return the parameters of a fit with their intervals of 95 %; check_far: also fit with far values of a stiffness.
 
     The variance is the sum of those by the information of data and prior and by jackknife, with Student's t: on
     synthetic insertions each alone covers 70 to 90 % (studies/calibration.py).
@@ -57,11 +57,13 @@ def intervals(fitted: Fitted) -> list[Interval]:
     for k, (value, width) in enumerate(zip(fitted.point[:size].tolist(), widths.tolist(), strict=True)):
         near = 1e-3 * (high[k] - low[k])
         bound = "lower" if value - low[k] < near else "upper" if high[k] - value < near else ""
-        found.append(Interval(value, value - width, value + width, _is_identified(fitted, k, width), bound))
+        found.append(
+            Interval(value, value - width, value + width, _is_identified(fitted, k, width, check_far), bound)
+        )
     return found
 
 
-def _is_identified(fitted: Fitted, k: int, width: float) -> bool:
+def _is_identified(fitted: Fitted, k: int, width: float, check_far: bool) -> bool:
     """Return whether an interval is useful, and, of a stiffness, no value a factor 4 away fits as well.
 
     The prior of a length is a measurement of it; a stiffness and a bevel have very wide priors.
@@ -69,7 +71,8 @@ def _is_identified(fitted: Fitted, k: int, width: float) -> bool:
     parameter = fitted.problem.parameters[k]
     if width > parameter.useful:
         return False
-    return parameter.name != "stiffness" or all(rise > chi2.ppf(_LEVEL, 1) for rise in _rises(fitted, k))
+    far = parameter.name == "stiffness" and check_far
+    return not far or all(rise > chi2.ppf(_LEVEL, 1) for rise in _rises(fitted, k))
 
 
 def _rises(fitted: Fitted, k: int) -> Iterator[float]:

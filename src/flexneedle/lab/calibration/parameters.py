@@ -96,7 +96,7 @@ def _guide(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
         raise InputError("fit = guide: the scenario has no guide (setup.guide_to_skin_mm)")
     first = math.log(scenario.setup.guide_to_skin_mm)
     low = max(first - 1.0, math.log(scenario.setup.tip_to_skin_mm) + 1e-3)  # the tip starts before the guide
-    yield Parameter("guide", "guide to skin", first, 0.1, low, first + 1.0, 0.02, math.log(1.25), True, "mm")
+    yield Parameter("guide", "guide to skin", first, 0.1, low, first + 1.0, 0.02, math.log(1.35), True, "mm")
 
 
 def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
@@ -110,7 +110,7 @@ def _yield(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
     first = math.log(_yield_of(scenario) or _FIRST_YIELD * scenario.needle.outer_diameter)
     low, high = math.log(0.02), math.log(min(layer.compression_length_mm for layer in scenario.tissue) * 0.69)
     yield Parameter(
-        "yield", "displacement that tears", min(first, high), 0.7, low, high, 0.05, math.log(3.0), True, "mm"
+        "yield", "displacement that tears", min(first, high), 0.75, low, high, 0.05, math.log(4.0), True, "mm"
     )
 
 

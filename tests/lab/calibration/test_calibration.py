@@ -1,0 +1,198 @@
+"""Calibrations of insertions that the model itself has made: parameters, intervals, and what is not identified."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.errors import InputError
+from flexneedle.lab.calibration.calibration import calibrate
+from flexneedle.lab.calibration.criteria import Likelihood, PredictionErrors
+from flexneedle.lab.calibration.files import read_record, write_calibration
+from flexneedle.lab.calibration.fit import Problem, fit, residuals_at
+from flexneedle.lab.calibration.parameters import make_needle, parameters_of, trial_of
+from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
+from flexneedle.lab.calibration.session import Session
+from flexneedle.scenario.files import load_scenario
+from simulated_session import AXIS, blank, simulate, without_slopes
+
+STIFF = {"tissue.0.shear_modulus_kpa": 660.0, "needle.bevel.offset_mm": 0.4, "setup.guide_to_skin_mm": 18.0}
+
+
+@pytest.fixture(scope="module")
+def guided():
+    return simulate(5, resting=1, seed=3, **STIFF)
+
+
+@pytest.fixture(scope="module")
+def fitted(guided):
+    return calibrate("gel", guided, ("stiffness", "bevel", "guide"))
+
+
+def problem_of(session, names=("stiffness", "bevel", "guide")):
+    scenario = fitting_scenario(load_scenario("gel"), session)
+    return Problem(scenario, parameters_of(scenario, names, 60.0), Replay.of(session))
+
+
+def test_the_values_of_the_recordings_are_found(fitted):
+    trial = fitted.trial
+    assert np.log(trial.stiffness[0]) == pytest.approx(np.log(2.0), abs=0.1)
+    np.testing.assert_allclose(trial.bevel, 0.4 * np.array([np.cos(0.6), np.sin(0.6)]), atol=0.05)
+    assert trial.guide_mm == pytest.approx(18.0, rel=0.03)
+    assert fitted.unidentified == {}
+    assert fitted.problems == ()
+    assert fitted.direction == pytest.approx(0.6, abs=0.15)
+
+
+def test_intervals_contain_the_values(fitted):
+    found = fitted.intervals
+    assert found["stiffness of gel"].low <= np.log(2.0) <= found["stiffness of gel"].high
+    assert found["guide to skin"].low <= np.log(18.0) <= found["guide to skin"].high
+
+
+def test_the_axis_of_the_sensor_is_found(fitted):
+    place = fitted.fitted.problem.nuisances(0)
+    np.testing.assert_allclose(fitted.fitted.point[place][:2], AXIS, atol=3e-3)
+
+
+def test_errors_of_readings_are_taken_as_such(fitted):
+    assert fitted.fitted.criterion is Likelihood
+
+
+def test_a_model_that_lacks_something_is_fitted_by_its_predictions():
+    """The recorded tissue tears, and the fitted one does not."""
+    session = simulate(
+        4, resting=1, noise=0.002, seed=4, **{"tissue.0.law": "tearing", "tissue.0.yield_mm": 0.1}
+    )
+    assert calibrate("gel", session, ("stiffness", "bevel")).fitted.criterion is PredictionErrors
+
+
+def test_the_scenario_has_the_values_and_priors(fitted):
+    scenario = fitted.scenario
+    assert scenario.tissue[0].shear_modulus_kpa == pytest.approx(330.0 * fitted.trial.stiffness[0])
+    assert scenario.needle.bevel.offset_mm == pytest.approx(np.linalg.norm(fitted.trial.bevel))
+    assert scenario.control.adaptive_mpc["modulus_log_sd"] < 0.3
+
+
+def test_open_loop_insertions_do_not_identify_the_stiffness():
+    session = without_slopes(simulate(5, resting=5, seed=5, noise=0.1))
+    found = calibrate("gel", session, ("stiffness", "bevel"))
+    assert "stiffness of gel" in found.unidentified
+    assert "move the guide" in found.unidentified["stiffness of gel"]
+    assert found.trial.stiffness[0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_bevel_is_fitted_at_the_scenarios_stiffness_if_that_is_unknown():
+    session = simulate(5, resting=5, seed=5, noise=0.1)
+    found = calibrate("gel", session, ("stiffness", "bevel"))
+    assert "stiffness of gel" in found.unidentified
+    bevel = load_scenario("gel").needle.bevel.offset_mm
+    assert np.linalg.norm(found.trial.bevel) == pytest.approx(bevel, rel=0.08)
+
+
+def mirrored(session):
+    flip = np.array([1.0, -1.0])
+    return Session(
+        tuple(
+            replace(one, position=flip * one.position, slope=flip * one.slope, guide=flip * one.guide)
+            for one in session.recordings
+        ),
+        session.guide_order,
+    )
+
+
+def test_a_mirrored_session_has_the_mirrored_bevel(guided, fitted):
+    again = calibrate("gel", mirrored(guided), ("stiffness", "bevel", "guide"))
+    np.testing.assert_allclose(again.trial.bevel * [1.0, -1.0], fitted.trial.bevel, atol=2e-3)
+    np.testing.assert_allclose(again.trial.stiffness, fitted.trial.stiffness, rtol=5e-3)
+
+
+def test_drift_from_insertion_to_insertion_is_found():
+    session = simulate(5, resting=1, seed=6)
+    scenario = fitting_scenario(load_scenario("gel").with_values({"setup.axes": 2}), session)
+    parameters = parameters_of(scenario, ("drift",), 60.0)
+    trial = trial_of(scenario, parameters, np.array([-0.2]))
+    tips, _ = Replay.of(session).predict([make_needle(scenario, trial)])
+    drifting = Session(
+        tuple(
+            replace(one, depth=tip[:, 0], position=tip[:, 1:3], slope=tip[:, 3:5])
+            for one, tip in zip(session.recordings, tips[0], strict=True)
+        )
+    )
+    point = fit(Problem(scenario, parameters, Replay.of(drifting)), Likelihood).point
+    assert point[0] == pytest.approx(-0.2, abs=0.03)
+
+
+def test_derivatives_of_residuals_are_those_of_finite_differences(guided):
+    problem = problem_of(guided)
+    rng = np.random.default_rng(1)
+    point = problem.start + 0.3 * rng.standard_normal(len(problem.start)) * np.minimum(problem.sd, 0.1)
+    found = residuals_at(problem, point)
+    for k in range(len(point)):
+        h = 0.02 if k < len(problem.parameters) else 1e-3
+        up, down = (
+            residuals_at(problem, point + s * h * np.eye(len(point))[k], derivatives=False) for s in (1, -1)
+        )
+        expected = np.concatenate([a - b for a, b in zip(down.values, up.values, strict=True)]) / (2 * h)
+        given = np.concatenate(found.slopes)[:, k]
+        assert np.abs(given - expected).max() < 0.1 * np.abs(expected).max() + 1e-6, k
+
+
+def test_a_roll_during_the_insertion_is_carried_out():
+    guide = np.zeros((13, 1))
+    one = blank("a", "0", guide, 5.0 * np.arange(13))
+    rolled = replace(one, roll=np.where(np.arange(13) > 6, np.pi, 0.0))
+    session = Session((one, rolled))
+    scenario = fitting_scenario(load_scenario("gel"), session)
+    tips, good = Replay.of(session).predict([make_needle(scenario, trial_of(scenario, (), np.array([])))])
+    assert good.all()
+    bends = tips[0, :, -1, 3] - tips[0, :, 6, 3]
+    assert bends[0] > 1e-3
+    assert bends[1] < -1e-3
+
+
+@pytest.mark.parametrize("order", ["before", "with", "after"])
+def test_the_guide_moves_before_with_or_after_the_advance(order):
+    guide = np.where(np.arange(13) >= 3, 2.0, 0.0)[:, None]
+    session = Session((blank("a", "0", guide, 5.0 * np.arange(13)),), order)
+    scenario = fitting_scenario(load_scenario("gel"), session)
+    tips, _ = Replay.of(session).predict([make_needle(scenario, trial_of(scenario, (), np.array([])))])
+    turn = tips[0, 0, 4, 1] - tips[0, 0, 3, 1]
+    ends = {"before": -0.5, "with": -0.35, "after": -0.2}
+    assert turn == pytest.approx(ends[order], abs=0.35)
+    assert np.diff(tips[0, 0, 2:5, 3]).min() < -0.01
+
+
+def test_parameters_that_cannot_be_fitted_are_refused(guided):
+    with pytest.raises(InputError, match=r"fit = colour: must be one of stiffness, bevel, guide"):
+        calibrate("gel", guided, ("colour",))
+    free = load_scenario("gel").with_values({"setup.guide_to_skin_mm": None})
+    with pytest.raises(InputError, match=r"fit = guide: the scenario has no guide"):
+        calibrate(free, guided, ("guide",))
+    with pytest.raises(InputError, match="session: has no recordings"):
+        calibrate("gel", Session(()), ("bevel",))
+
+
+def test_the_files_of_a_calibration_are_read_again(fitted, tmp_path):
+    path = tmp_path / "calibrated.toml"
+    write_calibration(fitted, path, "gel")
+    assert load_scenario(path).tissue == fitted.scenario.tissue
+    assert path.read_text().startswith("# Calibrated from gel with 5 recorded insertions of a.")
+    record = read_record(path)
+    assert record["fit"] == ["stiffness", "bevel", "guide"]
+    assert len(record["insertions"]) == 5
+
+
+def test_a_profile_has_its_minimum_at_the_fit(fitted):
+    profile = fitted.profile("guide", 3)
+    assert profile.values[1] == pytest.approx(fitted.trial.guide_mm, rel=1e-6)
+    assert profile.rise[0] > 1.0
+    assert profile.rise[2] > 1.0
+    assert profile.rise[1] == pytest.approx(0.0, abs=1.0)
+    with pytest.raises(InputError, match="profile = colour: must be one of stiffness of gel"):
+        fitted.profile("colour")
+
+
+def test_names_of_the_package():
+    assert flexneedle.calibrate is calibrate
