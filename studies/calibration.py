@@ -138,10 +138,10 @@ def close_loop(number: int, choice: Choice) -> dict[str, Any]:
     bevel = 1.0 if choice.same_bevel else factor**-CURVATURE_POWER
     phantom = draw(with_true_values(known, factor, bevel, scenario.phantom.guide_clearance_mm), rng)
     found = calibrate(scenario, Rehearsal(phantom, rng).record(draw_schedules(scenario, 3, rng)), choice.fit)
-    row = judge(found, {"stiffness": float(np.log(factor)), "bevel": phantom.scenario.needle.bevel.offset_mm})
+    true = {"stiffness": factor, "bevel": phantom.scenario.needle.bevel.offset_mm}
     return {
-        "factor": factor,
-        **row,
+        "true": true,
+        **judge(found, true | {"stiffness": float(np.log(factor))}),
         "as_is": steer(scenario, phantom, number),
         "calibrated": steer(found.scenario, phantom, number),
     }

@@ -32,21 +32,30 @@ def test_true_values_are_factors_of_the_scenario():
     assert true.phantom.guide_clearance_mm == 0.07
 
 
-def test_the_true_values_predict_the_end_and_wrong_ones_do_not():
-    scenario = calibration.guided_world(0, "world")
-    truth = Truth(
-        scenario.with_values({"tissue.0.shear_modulus_kpa": 2.0 * scenario.tissue[0].shear_modulus_kpa})
+def end_error(recorded, predicted):
+    """The end error of a prediction with factors on stiffness and bevel, of an insertion with others."""
+    scenario, plan = (
+        calibration.guided_world(0, "world"),
+        Schedule(np.linspace(0.0, 50.0, 11), np.zeros((11, 1))),
     )
-    plan = Schedule.draw(np.random.default_rng(0), 40.0, 10, 1, travel=2.0)
+    truth = Truth(calibration.with_true_values(scenario, *recorded, 0.0))
     session = Rehearsal(truth, np.random.default_rng(1), SensorErrors(0.0, 0.0), ModelPlant).record([plan])
+    bevel = np.array([predicted[1] * scenario.needle.bevel.offset_mm])
+    guide = scenario.setup.guide_to_skin_mm
+    return calibration.end_error(
+        scenario, session, Trial(np.array(predicted[:1]), bevel, guide, 0.0, None, 0.0)
+    )
 
-    def end_error(factor, bevel):
-        offset = bevel * scenario.needle.bevel.offset_mm
-        trial = Trial(np.array([factor]), np.array([offset]), scenario.setup.guide_to_skin_mm, 0.0, None, 0.0)
-        return calibration.end_error(scenario, session, trial)
 
-    assert end_error(2.0, 1.0) < 0.05
-    assert min(end_error(1.0, 1.0), end_error(2.0, 1.3)) > 0.15
+def test_the_true_values_predict_the_end_and_wrong_ones_do_not():
+    assert end_error((2.0, 1.0), (2.0, 1.0)) < 1e-3
+    assert end_error((2.0, 1.0), (1.0, 1.0)) > 0.2
+    assert end_error((2.0, 1.0), (2.0, 1.3)) > 0.2
+
+
+def test_ends_are_compared_at_the_same_depth():
+    """A strongly bent needle is shorter than its advance."""
+    assert end_error((20.0, 1.0), (20.0, 1.0)) < 1e-3
 
 
 def fitted(stiffness, bevel):
@@ -117,10 +126,11 @@ def test_a_second_run_skips_the_numbers_in_the_file(tmp_path, monkeypatch, capsy
         calibration.main(["sets", "--count", "4", "--fit", "bevel", "--kind", "wide", "--jobs", "2", *out])
         == 0
     )
-    assert [each[1] for each in asked] == [[0, 1], [2, 3]]
+    assert calibration.main(["sets", "--first", "3", "--count", "2", *out]) == 0
+    assert [each[1] for each in asked] == [[0, 1], [2, 3], [4]]
     assert (asked[1][2], asked[1][3]) == (Choice(("bevel",), "wide"), 2)
     rows = [json.loads(line)["number"] for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
-    assert rows == [0, 1, 2, 3]
+    assert rows == [0, 1, 2, 3, 4]
     assert capsys.readouterr().out.count("|sets|4|") == 1
 
 
@@ -144,10 +154,31 @@ def test_a_set_is_fitted():
     assert row["stiffness_covered"]
     assert abs(row["stiffness_error"]) < 0.1
     assert max(row["end_error_mm"]) < 0.1
+    assert row["end_error_mm"][0] != row["end_error_mm"][1]
+
+
+@pytest.mark.parametrize("same_bevel", [False, True])
+def test_both_loops_are_on_the_stiffer_phantom_and_have_its_curvature_unless_asked(monkeypatch, same_bevel):
+    found = fitted((4.0, 3.0, 5.0), (1.0, 0.5, 1.5))
+    found.scenario = "calibrated"
+    monkeypatch.setattr(calibration, "calibrate", lambda *_: found)
+    monkeypatch.setattr(calibration, "steer", lambda scenario, phantom, seed: (scenario, phantom, seed))
+    row = calibration.close_loop(0, Choice(calibration.FIT, "world", same_bevel))
+    scenario = calibration.guided_world(0, "world")
+    (first, phantom, seed), (second, other, again) = row["as_is"], row["calibrated"]
+    assert (first, second, seed, again) == (scenario, "calibrated", 0, 0)
+    assert phantom is other
+    factor = row["true"]["stiffness"]
+    assert 10.0 < factor < 100.0
+    layers = [each.tissue[0].shear_modulus_kpa for each in (phantom.scenario, scenario)]
+    assert layers[0] == pytest.approx(factor * layers[1])
+    offset = scenario.needle.bevel.offset_mm * (1.0 if same_bevel else factor**-0.75)
+    low, high = scenario.phantom.bevel_factor
+    assert low * offset <= row["true"]["bevel"] <= high * offset
 
 
 @pytest.mark.long
 def test_a_calibrated_loop_is_more_accurate_on_the_same_phantom():
     row = calibration.close_loop(0, Choice(calibration.FIT, "world"))
-    assert row["factor"] > 10.0
+    assert row["true"]["stiffness"] > 10.0
     assert row["calibrated"]["error_mm"] < 0.5 * row["as_is"]["error_mm"]
