@@ -136,8 +136,9 @@ def _check(training: Session, test: Session) -> None:
 def sessions_of(fold: Fold) -> Iterator[Fold]:
     """Yield a fold for each session that is tested; one without training insertions is trained by all of them."""
     for name in fold.test.names:
-        training = fold.training.of(name)
-        if not training.recordings:
+        if name in fold.training.names:
+            training = fold.training.of(name)
+        else:
             alike = tuple(replace(one, session=name) for one in fold.training.recordings)
             training = replace(fold.training, recordings=alike)
         yield fold._replace(training=training, test=fold.test.of(name))

@@ -19,11 +19,11 @@ def add_parser(commands: Commands) -> None:
         "fit a scenario to recorded insertions",
         _calibrate,
         "flexneedle calibrate session gel --out calibrated.toml",
-        "flexneedle calibrate session mine.toml --fit stiffness bevel guide clearance yield --profile stiffness",
+        "flexneedle calibrate session mine.toml --fit stiffness bevel guide yield --profile yield",
         about="Fit a scenario to the insertions of a session. Exit status 1: the fit is not to be trusted, for the "
         "reasons that are printed.",
     )
-    parser.add_argument("session", metavar="SESSION", type=expand_home, help="folder of flexneedle import")
+    parser.add_argument("session", metavar="SESSION", type=expand_home, help="folder of the session")
     parser.add_argument("scenario", metavar="SCENARIO", help="scenario from which the fit starts")
     parser.add_argument(
         "--fit",
@@ -33,7 +33,7 @@ def add_parser(commands: Commands) -> None:
         help="parameters: stiffness, bevel, guide, clearance, yield, drift (default: the first three)",
     )
     parser.add_argument(
-        "--session", metavar="NAME", dest="name", help="one of the sessions in the folder (default: all)"
+        "--session", metavar="NAME", dest="name", help="use one of the sessions (default: all)"
     )
     parser.add_argument(
         "--profile", metavar="NAME", help="draw the profile likelihood of a parameter, beside the scenario"

@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
         metavar="DIR",
         help="folder of page and figures (default: SESSION/validation)",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     add_width(parser)
 
 
