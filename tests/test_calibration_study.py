@@ -126,11 +126,11 @@ def test_a_second_run_skips_the_numbers_in_the_file(tmp_path, monkeypatch, capsy
         calibration.main(["sets", "--count", "4", "--fit", "bevel", "--kind", "wide", "--jobs", "2", *out])
         == 0
     )
-    assert calibration.main(["sets", "--first", "3", "--count", "2", *out]) == 0
-    assert [each[1] for each in asked] == [[0, 1], [2, 3], [4]]
+    assert calibration.main(["sets", "--first", "5", "--count", "1", *out]) == 0
+    assert [each[1] for each in asked] == [[0, 1], [2, 3], [5]]
     assert (asked[1][2], asked[1][3]) == (Choice(("bevel",), "wide"), 2)
     rows = [json.loads(line)["number"] for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
-    assert rows == [0, 1, 2, 3, 4]
+    assert rows == [0, 1, 2, 3, 5]
     assert capsys.readouterr().out.count("|sets|4|") == 1
 
 
