@@ -17,6 +17,7 @@ from scenario_reference import schema, tables
 # Pages that take more than about 5 s, and the longest pages.
 LONG = {"emulate.md", "index.md", "warnings.md"}
 SLOW = {
+    "calibrate.md",
     "controllers.md",
     "extend.md",
     "needle-and-tissue.md",
