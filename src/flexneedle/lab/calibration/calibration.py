@@ -3,13 +3,14 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.lab.calibration.criteria import Likelihood, PredictionErrors
+from flexneedle.lab.calibration.criteria import Criterion, Likelihood, PredictionErrors
 from flexneedle.lab.calibration.deviations import KINDS
 from flexneedle.lab.calibration.fit import Fitted, Problem, fit, reading_share
 from flexneedle.lab.calibration.intervals import Interval, fixed, intervals, profile
@@ -21,8 +22,10 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
 DEFAULT_FIT = ("stiffness", "bevel", "guide")
-_OTHER_STARTS = {"stiffness": (np.log(10.0), -np.log(10.0)), "yield": (np.log(0.3),)}
-"""Further starts of a fit, as changes of a coordinate."""
+_FACTORS = (1.0, 0.1, 10.0, 100.0)
+"""On the stiffness, from which fits start."""
+_YIELDS = (0.3,)
+"""Factors on the yield, likewise."""
 _SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
 _READINGS = 0.5  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
 _FIRST_ROUNDS = 2  # until the noise decides on the criterion
@@ -208,22 +211,37 @@ def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
     By the likelihood if predictions have more error from the readings than from what the model lacks, else by their
     errors.
     """
-    first = fit(problem, Likelihood, rounds=_FIRST_ROUNDS)
-    criterion = Likelihood if reading_share(first) > _READINGS else PredictionErrors
-    chosen = fit(problem, criterion, first.point if criterion is Likelihood else None, first.noise)
-    again = (fit(problem, chosen.criterion, start, chosen.noise) for start in _other_starts(problem))
-    best, *others = sorted([chosen, *again], key=lambda each: each.cost)
-    return best, tuple(others)
+    coarse = [fit(problem, Likelihood, start, rounds=1) for start in _starts(problem)]
+    lead, *others = sorted(coarse, key=lambda each: each.cost)
+    first = fit(problem, Likelihood, lead.point, lead.noise, rounds=_FIRST_ROUNDS)
+    criterion: type[Criterion]
+    if reading_share(first) > _READINGS:
+        criterion, starts = Likelihood, [first.point, *(each.point for each in others[:1])]
+    else:
+        criterion, starts = PredictionErrors, [problem.start, first.point, *_starts(problem, _YIELDS)]
+    best, *rest = sorted(
+        (fit(problem, criterion, start, first.noise) for start in starts), key=lambda each: each.cost
+    )
+    return best, tuple(rest)
 
 
-def _other_starts(problem: Problem) -> Iterator[Floats]:
-    """Yield starts of the fit besides the prior's mean, for parameters with several minima."""
-    for name, changes in _OTHER_STARTS.items():
-        places = [k for k, each in enumerate(problem.parameters) if each.name == name]
-        for change in changes if places else ():
-            start = problem.start.copy()
-            start[places] += change
-            yield np.clip(start, *problem.bounds)
+def _starts(problem: Problem, yields: Sequence[float] = (1.0,)) -> Iterator[Floats]:
+    """Yield starts of a fit: factors on the stiffness at the same curvature of the path, or on the yield.
+
+    The curvature of a free path is b k₀^(3/4) (docs/theory.md eq. 10).
+    """
+    names = [each.name for each in problem.parameters]
+    stiffness, bevel, torn = (
+        np.array([name == wanted for name in names]) for wanted in ("stiffness", "bevel", "yield")
+    )
+    factors = _FACTORS if stiffness.any() and yields == (1.0,) else (1.0,)
+    for factor, share in product(factors, yields if torn.any() else (1.0,)):
+        start = problem.start.copy()
+        part = start[: len(names)]
+        part[stiffness] += np.log(factor)
+        part[bevel] *= factor**-0.75
+        part[torn] += np.log(share)
+        yield np.clip(start, *problem.bounds)
 
 
 def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
