@@ -106,5 +106,7 @@ def fixed(fitted: Fitted, k: int, value: float, **limits: int) -> Fitted:
 
 
 def profile(fitted: Fitted, k: int, values: Sequence[float]) -> Floats:
-    """Return the rise of −2 ln of the likelihood at values of a parameter, with all others fitted again."""
-    return np.array([fixed(fitted, k, value).cost for value in values]) - fitted.cost
+    """Return the rise of the loss above its least at values of a parameter, with all others fitted again."""
+    costs = np.array([fixed(fitted, k, value).cost for value in values])
+    rise: Floats = costs - costs.min()
+    return rise

@@ -28,6 +28,8 @@ def draw_profile(found: Profile, fitted: float) -> Figure:
         ax.axvline(fitted, color=QUIET, linewidth=0.8)
         if parameter.log:
             ax.set_xscale("log")
+            for place in (ax.xaxis.set_major_formatter, ax.xaxis.set_minor_formatter):
+                place(lambda value, _: f"{value:.3g}")
         unit = f" ({parameter.unit})" if parameter.unit else ""
         ax.set_xlabel(f"{parameter.label}{unit}")
         ax.set_ylabel("rise of the loss")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import to_matrix
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.calibration.importing.map_file import FIT, FrameMap
 from flexneedle.lab.calibration.importing.rows import Rows
 from flexneedle.lab.calibration.session import Recording
@@ -26,33 +27,15 @@ _ALONG = 0.3  # sine of the least angle between y and x
 _CERTAIN = 4.0  # standard errors of a response
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A frame: rotation (3, 3) from the tracker's axes to the needle's, and the translation (3,) after it, mm."""
-
-    rotation: Floats
-    translation: Floats
-
-    def points(self, positions: Floats) -> Floats:
-        """Return positions (r, 3) in the needle's frame."""
-        found: Floats = positions @ self.rotation.T + self.translation
-        return found
-
-    def vectors(self, directions: Floats) -> Floats:
-        """Return directions (r, 3) in the needle's frame."""
-        found: Floats = directions @ self.rotation.T
-        return found
-
-
-def given_frame(given: FrameMap) -> Frame:
+def given_frame(given: FrameMap) -> Rigid:
     """Return the frame of a map whose x is named; another axis than x for a y that is fitted."""
     x = _unit(given.x)
     y = _unit(given.y) if given.y != FIT else _unit("y" if given.x[-1] != "y" else "z")
     rotation = np.stack([x, y, np.cross(x, y)])
     if given.registration is None:
-        return Frame(rotation, np.zeros(3))
+        return Rigid(rotation, np.zeros(3))
     turn = to_matrix(np.array(given.registration.rotation))
-    return Frame(rotation @ turn, rotation @ np.array(given.registration.translation_mm))
+    return Rigid(rotation @ turn, rotation @ np.array(given.registration.translation_mm))
 
 
 def _unit(direction: str) -> Floats:
@@ -61,7 +44,7 @@ def _unit(direction: str) -> Floats:
     return vector
 
 
-def frame_with_fitted_x(given: FrameMap, session: Sequence[Rows]) -> Frame:
+def frame_with_fitted_x(given: FrameMap, session: Sequence[Rows]) -> Rigid:
     """Return the frame with x along the insertions of a session, and y closest to the axis of the tracker in the map.
 
     If the map has "fit" for y, any axis. Raises InputError without an insertion that is long enough.
@@ -81,7 +64,7 @@ def frame_with_fitted_x(given: FrameMap, session: Sequence[Rows]) -> Frame:
             f"{session[0].source}: frame.y = {given.y!r} is along the insertion: name another axis of the tracker"
         )
     y /= np.linalg.norm(y)
-    return Frame(np.stack([x, y, np.cross(x, y)]), np.zeros(3))
+    return Rigid(np.stack([x, y, np.cross(x, y)]), np.zeros(3))
 
 
 def _tangent(rows: Rows) -> Floats | None:
@@ -101,7 +84,7 @@ def _tangent(rows: Rows) -> Floats | None:
     return None
 
 
-def with_fitted_y(frame: Frame, recordings: Sequence[Recording], source: str) -> Frame:
+def with_fitted_y(frame: Rigid, recordings: Sequence[Recording], source: str) -> Rigid:
     """Return the frame rolled about x so that the guide's y and z are its own; recordings are in the given frame."""
     response = guide_response(recordings)
     if response is None or not response.certain.any():
@@ -125,7 +108,7 @@ class Response:
 
     @property
     def certain(self) -> NDArray[np.bool_]:
-        """Whether (a, a) each number differs from 0."""
+        """Flags (a, a): the number differs from 0."""
         return np.abs(self.matrix) > _CERTAIN * self.errors
 
 

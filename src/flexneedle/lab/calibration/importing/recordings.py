@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from flexneedle.errors import InputError
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.calibration.importing.frames import (
-    Frame,
     frame_with_fitted_x,
     given_frame,
     with_fitted_y,
@@ -31,7 +31,7 @@ class Found:
     recordings: tuple[Recording, ...]
     notes: tuple[str, ...]
     missing: float = 0.0
-    frames: dict[str, Frame] = field(default_factory=dict)
+    frames: dict[str, Rigid] = field(default_factory=dict)
 
 
 def read_recordings(files: Sequence[tuple[Path, str]], recording_map: RecordingMap) -> Found:
@@ -58,7 +58,7 @@ def read_recordings(files: Sequence[tuple[Path, str]], recording_map: RecordingM
                 notes.append(f"{rows.source}: {len(found.time)} steps, fewer than {LEAST_STEPS}: left out")
             else:
                 steps.setdefault(rows.session, []).append(found)
-    recordings, frames = list[Recording](), dict[str, Frame]()
+    recordings, frames = list[Recording](), dict[str, Rigid]()
     for name, found_steps in steps.items():
         frames[name], made, more = _in_frame(in_order(found_steps), recording_map)
         recordings += made
@@ -82,7 +82,7 @@ def _known(rows: Rows) -> tuple[Rows, str]:
 
 def _in_frame(
     session: Sequence[Rows], recording_map: RecordingMap
-) -> tuple[Frame, list[Recording], list[str]]:
+) -> tuple[Rigid, list[Recording], list[str]]:
     """Return the frame of a session, its recordings, and notes."""
     given = recording_map.frame
     frame = frame_with_fitted_x(given, session) if given.x == FIT else given_frame(given)
@@ -103,10 +103,10 @@ def _is_short(one: Recording) -> bool:
     return len(one.depth) < LEAST_STEPS
 
 
-def _recording(rows: Rows, frame: Frame, recording_map: RecordingMap) -> tuple[Recording, str]:
+def _recording(rows: Rows, frame: Rigid, recording_map: RecordingMap) -> tuple[Recording, str]:
     """Return the steps of an insertion in a frame up to its deepest one, and a note on later ones."""
     given, axes = recording_map.frame, recording_map.axes
-    position = frame.points(rows.position)
+    position = frame.apply(rows.position)
     skin = position[0, 0] - given.first_depth_mm if given.skin_mm is None else given.skin_mm
     reached = position[:, 0].max() - position[0, 0]
     if reached < 0.5 * np.ptp(position, axis=0).max():
@@ -131,18 +131,18 @@ def _recording(rows: Rows, frame: Frame, recording_map: RecordingMap) -> tuple[R
     return made, note
 
 
-def _stage(moved: Floats, given: StageMap | None, frame: Frame) -> Floats:
+def _stage(moved: Floats, given: StageMap | None, frame: Rigid) -> Floats:
     """Return y, z (k, 2) of a stage whose position is in the axes of the tracker, or in the needle's frame."""
     in_tracker = given is not None and given.position is not None
-    return (frame.points(moved) if in_tracker else moved)[:, 1:]
+    return (frame.apply(moved) if in_tracker else moved)[:, 1:]
 
 
-def _slopes(rows: Rows, frame: Frame, position: Floats) -> Floats:
+def _slopes(rows: Rows, frame: Rigid, position: Floats) -> Floats:
     """Return dy/dx, dz/dx (k, 2) of the needle at the tip. Raises InputError if its axis is not along the path."""
     if np.isfinite(rows.angle).any():
         tangents: Floats = np.tan(rows.angle)
         return tangents
-    axis = frame.vectors(rows.axis)
+    axis = rows.axis @ frame.rotation.T
     if np.isfinite(axis).any():
         path, mean = position[-1] - position[0], np.nanmean(axis, axis=0)
         cosine = mean @ path / max(1e-9, float(np.linalg.norm(mean) * np.linalg.norm(path)))
