@@ -10,7 +10,6 @@ from flexneedle.lab.calibration.baselines import (
     heading,
     pairs_ahead,
     predictors,
-    rests,
     whole,
 )
 from simulated_session import AXIS, blank
@@ -67,8 +66,8 @@ def test_the_axis_offset_ignores_steps_in_which_the_guide_moves():
     guide = 2.0 * np.arange(13.0)[:, None] * np.ones(2)
     wrong = recording(moved.position, moved.slope + 0.5, guide)
     np.testing.assert_allclose(axis_offset([moved, wrong]), AXIS, atol=1e-9)
-    assert rests(moved)
-    assert not rests(wrong)
+    assert moved.rests
+    assert not wrong.rests
     np.testing.assert_array_equal(axis_offset([wrong]), np.zeros(2))
 
 

@@ -19,14 +19,9 @@ Pairs = tuple[Indices, Indices]
 """Steps i and j of predictions of a recording."""
 REGRESSION = "regression"
 """Name of the predictor that knows the motion of the guide after step i."""
-_RESTS_MM = 0.05
+_STILL_MM = 0.05
 _DEPTH_SCALE_MM = 50.0
 _LEAST_ADVANCE_MM = 0.5
-
-
-def rests(one: Recording) -> bool:
-    """Return whether the guide rests during an insertion."""
-    return one.guide_moves < _RESTS_MM
 
 
 def pairs_ahead(one: Recording, ahead: float) -> Pairs:
@@ -58,7 +53,7 @@ def axis_offset(training: Sequence[Recording]) -> Floats:
     gaps = []
     for one in training:
         advance = np.diff(one.depth)
-        still = (np.abs(np.diff(one.guide, axis=0)) < _RESTS_MM).all(axis=1) & (advance > _LEAST_ADVANCE_MM)
+        still = (np.abs(np.diff(one.guide, axis=0)) < _STILL_MM).all(axis=1) & (advance > _LEAST_ADVANCE_MM)
         path = np.diff(one.position, axis=0)[still] / advance[still, None]
         gaps.append(0.5 * (one.slope[1:] + one.slope[:-1])[still] - path)
     every = np.concatenate(gaps)

@@ -1,7 +1,8 @@
 """Calibration: a scenario fitted to recorded insertions, with intervals, and what the data do not say."""
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -13,9 +14,16 @@ from flexneedle.errors import InputError
 from flexneedle.lab.calibration.criteria import Criterion, Likelihood, PredictionErrors
 from flexneedle.lab.calibration.deviations import KINDS
 from flexneedle.lab.calibration.fit import Fitted, Problem, fit, reading_share
-from flexneedle.lab.calibration.intervals import Interval, fixed, intervals, profile
-from flexneedle.lab.calibration.parameters import Parameter, Trial, parameters_of, trial_of, with_trial
-from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
+from flexneedle.lab.calibration.intervals import SAME_COST, Interval, fixed, intervals, profile
+from flexneedle.lab.calibration.parameters import (
+    Parameter,
+    Trial,
+    at_same_curvature,
+    parameters_of,
+    trial_of,
+    with_trial,
+)
+from flexneedle.lab.calibration.prediction import STEEP, Replay, fitting_scenario, shallow
 from flexneedle.lab.calibration.session import Session
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -26,8 +34,8 @@ _FACTORS = (1.0, 0.1, 10.0, 100.0)
 """On the stiffness, from which fits start."""
 _YIELDS = (0.3,)
 """Factors on the yield, likewise."""
-_SAME_COST, _OTHER_POINT = 3.84, 3.0  # two minima: rise of the cost; distance in standard deviations
-_READINGS = 0.5  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
+_OTHER_POINT = 3.0  # distance in standard deviations of two minima
+_READINGS = 0.1  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
 _FIRST_ROUNDS = 2  # until the noise decides on the criterion
 _PROFILED = 1.5  # half-widths of the interval, to either side
 _MOVED = 1e-3  # of the prior's standard deviation
@@ -129,28 +137,56 @@ class Calibration:
 
     def _find_problems(self) -> Iterator[str]:
         point, sd = self.fitted.point, self.fitted.problem.sd
-        if not self.fitted.settled:
+        if not self.final.settled:
             yield "the fit did not settle"
-        if not self.fitted.residuals.converged:
+        if not self.final.residuals.converged:
             yield "some steps of the model did not converge"
         for each, interval in zip(self.parameters, self.intervals.values(), strict=True):
-            if interval.bound:
+            if interval.bound and (interval.identified or interval.refuted):
                 value = f"{each.value(interval.value):.4g} {each.unit}".rstrip()
                 yield f"{each.label} is at its {interval.bound} bound, {value}"
         size = len(self.parameters)
         if size and (np.abs(point - self.fitted.problem.start)[:size] < _MOVED * sd[:size]).all():
             yield "the fit did not move from its start"
+        yield from self._find_minima()
+
+    def _find_minima(self) -> Iterator[str]:
+        """Yield a problem if another minimum fits alike, not only along what is not identified."""
+        size, point = len(self.parameters), self.fitted.point
+        open_ones = np.array([each.label in self.unidentified for each in self.parameters])
+        scale = np.sqrt(np.diag(np.linalg.inv(self.fitted.information)))[:size]
         for other in self.others:
-            scale = np.sqrt(np.diag(np.linalg.inv(self.fitted.information)))[:size]
             apart = np.abs(other.point - point)[:size] / scale
-            if other.settled and other.cost - self.fitted.cost < _SAME_COST and apart.max() > _OTHER_POINT:
-                label = self.parameters[int(apart.argmax())].label
-                here, there = (
-                    self.parameters[int(apart.argmax())].value(p[int(apart.argmax())])
-                    for p in (point, other.point)
-                )
-                yield f"two minima fit alike: {label} = {here:.4g} or {there:.4g}"
+            alike = other.settled and other.cost - self.fitted.cost < SAME_COST
+            if alike and apart.max() > _OTHER_POINT and not (apart[open_ones] > 1.0).any():
+                k = int(apart.argmax())
+                here, there = (self.parameters[k].value(float(each[k])) for each in (point, other.point))
+                yield f"two minima fit alike: {self.parameters[k].label} = {here:.4g} or {there:.4g}"
                 break
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know about the fit, besides `problems`."""
+        return tuple(self._find_notes())
+
+    def _find_notes(self) -> Iterator[str]:
+        used, steps = (
+            sum(len(one.depth) for one in recordings)
+            for recordings in (self.fitted.problem.replay.recordings, self.session.recordings)
+        )
+        if used < steps:
+            yield (
+                f"{steps - used} of {steps} steps are not used: the needle has turned by more than {STEEP:g} rad, too "
+                "far for the model"
+            )
+        for each in self.parameters:
+            if self.intervals[each.label].refuted:
+                value = each.value(float(self.final.point[self.parameters.index(each)]))
+                shown = f"{value:.2g} {each.unit}".rstrip()
+                yield (
+                    f"{each.label}: the recordings do not determine it, but contradict the scenario's value; the "
+                    f"calibrated scenario has {shown}, which fits best"
+                )
 
     def profile(self, name: str, count: int = 9) -> Profile:
         """Return the profile of a parameter, by its name or its label. Raises InputError for another."""
@@ -197,9 +233,10 @@ def calibrate(
     if not session.recordings:
         raise InputError("session: has no recordings")
     loaded = load_scenario(scenario)
-    prepared = fitting_scenario(loaded, session)
-    reached = max(float(one.depth.max()) for one in session.recordings)
-    problem = Problem(prepared, parameters_of(prepared, fit, reached), Replay.of(session))
+    used = shallow(session)
+    prepared = fitting_scenario(loaded, used)
+    reached = max(float(one.depth.max()) for one in used.recordings)
+    problem = Problem(prepared, parameters_of(prepared, fit, reached), Replay.of(used))
     best, others = _minimize(problem)
     free = _identify(best)
     return Calibration(loaded, session, best, others, *free)
@@ -226,28 +263,22 @@ def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
 
 
 def _starts(problem: Problem, yields: Sequence[float] = (1.0,)) -> Iterator[Floats]:
-    """Yield starts of a fit: factors on the stiffness at the same curvature of the path, or on the yield.
-
-    The curvature of a free path is b k₀^(3/4) (docs/theory.md eq. 10).
-    """
+    """Yield starts of a fit: factors on the stiffness at the same curvature of the path, or on the yield."""
     names = [each.name for each in problem.parameters]
-    stiffness, bevel, torn = (
-        np.array([name == wanted for name in names]) for wanted in ("stiffness", "bevel", "yield")
-    )
+    stiffness, torn = (np.array([name == wanted for name in names]) for wanted in ("stiffness", "yield"))
     factors = _FACTORS if stiffness.any() and yields == (1.0,) else (1.0,)
     for factor, share in product(factors, yields if torn.any() else (1.0,)):
-        start = problem.start.copy()
-        part = start[: len(names)]
-        part[stiffness] += np.log(factor)
-        part[bevel] *= factor**-0.75
-        part[torn] += np.log(share)
+        start = at_same_curvature(problem.parameters, problem.start, math.log(factor))
+        start[: len(names)][stiffness] += math.log(factor)
+        start[: len(names)][torn] += math.log(share)
         yield np.clip(start, *problem.bounds)
 
 
 def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
     """Return the fit with what the data do not identify at the start's values, and the intervals of all parameters.
 
-    One parameter is fixed at a time, the least identified first: another may be identified once it is.
+    One parameter is fixed at a time, the least identified first: another may be identified once it is. A parameter
+    stays free if the data contradict its value at the start.
     """
     found: dict[str, Interval] = {}
     while True:
@@ -258,6 +289,8 @@ def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
             return fitted, now | found
         widths = {each.label: each.useful for each in fitted.problem.parameters}
         worst = max(open_ones, key=lambda label: (now[label].high - now[label].low) / widths[label])
-        found[worst] = now[worst]
         k = labels.index(worst)
-        fitted = fixed(fitted, k, fitted.problem.parameters[k].start)
+        without = fixed(fitted, k, fitted.problem.parameters[k].start)
+        refuted = without.cost - fitted.cost > SAME_COST and fitted.problem.moves
+        found[worst] = replace(now[worst], refuted=refuted)
+        fitted = fitted if refuted else without

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.lab.calibration.baselines import Pairs, Predictor, pairs_ahead, predictors, rests, whole
+from flexneedle.lab.calibration.baselines import Pairs, Predictor, pairs_ahead, predictors, whole
 from flexneedle.lab.calibration.criteria import PredictionErrors
 from flexneedle.lab.calibration.deviations import Noise
 from flexneedle.lab.calibration.fit import Fitted, Problem, conclude, fit, paths_at, residuals_at
 from flexneedle.lab.calibration.folds import Fold, sessions_of
 from flexneedle.lab.calibration.forecast import Forecast, forecast
 from flexneedle.lab.calibration.parameters import Parameter, parameters_of
-from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
+from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
 from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Flags, Floats
@@ -86,7 +86,7 @@ class Errors:
 
 def predict_fold(fold: Fold, ahead: Sequence[float]) -> Iterator[Tested]:
     """Yield the insertions of a fold's test with their predictions at distances ahead (mm)."""
-    resting = [one for one in fold.training.recordings if rests(one)]
+    resting = [one for one in fold.training.recordings if one.rests]
     for part in sessions_of(fold):
         every = (*part.training.recordings, *part.test.recordings)
         scenario = fitting_scenario(fold.scenario, replace(part.test, recordings=every))
@@ -96,12 +96,12 @@ def predict_fold(fold: Fold, ahead: Sequence[float]) -> Iterator[Tested]:
             distance: predictors(training, [pairs_ahead(one, distance) for one in training])
             for distance in ahead
         }
-        still = [one for one in training if rests(one)] or resting
+        still = [one for one in training if one.rests] or resting
         to_end = predictors(still, [whole(one) for one in still]) if still else {}
         last = max(1, *part.training.order, *part.test.order)
         forecasts = forecast(fitted, part.test)
         for one, order, found in zip(part.test.recordings, part.test.order, forecasts, strict=True):
-            yield Tested(one, order / last, found, simple, to_end if rests(one) else {})
+            yield Tested(one, order / last, found, simple, to_end if one.rests else {})
 
 
 def fit_nuisances(scenario: Scenario, training: Session, drift: float) -> Fitted:
@@ -109,7 +109,7 @@ def fit_nuisances(scenario: Scenario, training: Session, drift: float) -> Fitted
 
     drift: change of ln of the moduli from an insertion to the next.
     """
-    replay = Replay.of(training)
+    replay = Replay.of(shallow(training))
     fixed = [_fix(each, drift) for each in parameters_of(scenario, ("drift",), 0.0) if drift != 0.0]
     free = parameters_of(scenario, ("bevel",), 0.0) if scenario.needle.bevel.offset_mm > 0.0 else ()
     start = _fit_direction(Problem(scenario, (*free, *fixed), replay), len(free))

@@ -30,6 +30,7 @@ def write_calibration(found: Calibration, path: Path, source: str) -> None:
         lines.append(
             f"# Direction of the bevel in the recordings: {math.degrees(found.direction):.0f}° from y towards z."
         )
+    lines += [f"# Note: {note}" for note in found.notes]
     lines += [f"# WARNING: {problem}" for problem in found.problems]
     text = "\n".join(line.replace("\n", " ") for line in lines)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -56,6 +57,7 @@ def _record(found: Calibration, source: str) -> dict[str, Any]:
         },
         "direction_rad": found.direction,
         "noise": found.fitted.noise.sd.tolist(),
+        "notes": list(found.notes),
         "problems": list(found.problems),
         "versions": dict(versions()),
     }

@@ -39,6 +39,11 @@ class Problem:
         """Names of the sessions."""
         return tuple(dict.fromkeys(one.session for one in self.replay.recordings))
 
+    @property
+    def moves(self) -> bool:
+        """Whether guide or base moves in a recording."""
+        return not all(one.rests for one in self.replay.recordings)
+
     @cached_property
     def _nuisances(self) -> Floats:
         """Standard deviations of what is fitted besides the parameters."""

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import chi2, t
 
 from flexneedle.lab.calibration.fit import Fitted, Problem, fit
+from flexneedle.lab.calibration.parameters import at_same_curvature
 from flexneedle.types import Floats
 
 _LEVEL = 0.95
@@ -14,6 +15,8 @@ _LEAST_RECORDINGS = 3  # for a jackknife
 _NORMAL = (
     1.96  # standard deviations; with three insertions Student's t would leave every stiffness unidentified
 )
+SAME_COST = float(chi2.ppf(_LEVEL, 1))
+"""Rise of the cost up to which two values of a parameter fit alike."""
 _FAR = 1.4  # distance of the points of the profile that test whether a logarithm is identified: a factor 4
 
 
@@ -21,7 +24,8 @@ _FAR = 1.4  # distance of the points of the profile that test whether a logarith
 class Interval:
     """A parameter with its interval, in the coordinate of the fit.
 
-    identified: whether the data give it; bound: "lower" or "upper" if the fit ended there, else "".
+    identified: whether the data give it; bound: "lower" or "upper" if the fit ended there, else ""; refuted: whether
+    the data do not give it, but contradict the scenario's value.
     """
 
     value: float
@@ -29,6 +33,7 @@ class Interval:
     high: float
     identified: bool
     bound: str = ""
+    refuted: bool = False
 
 
 def jackknife(fitted: Fitted) -> Floats:
@@ -76,13 +81,15 @@ def intervals(fitted: Fitted, *, check_far: bool = True) -> list[Interval]:
 def _is_identified(fitted: Fitted, k: int, width: float, check_far: bool) -> bool:
     """Return whether an interval is useful, and, of a stiffness, no value a factor 4 away fits as well.
 
-    The prior of a length is a measurement of it; a stiffness and a bevel have very wide priors.
+    The prior of a length is a measurement of it; a stiffness and a bevel have very wide priors. Without motion across
+    the needle a stiffness is not identified by what a fit makes of the entry.
     """
     parameter = fitted.problem.parameters[k]
-    if width > parameter.useful:
+    stiffness = parameter.name == "stiffness"
+    if width > parameter.useful or (stiffness and not fitted.problem.moves):
         return False
-    far = parameter.name == "stiffness" and check_far
-    return not far or all(rise > chi2.ppf(_LEVEL, 1) for rise in _rises(fitted, k))
+    far = stiffness and check_far
+    return not far or all(rise > SAME_COST for rise in _rises(fitted, k))
 
 
 def _rises(fitted: Fitted, k: int) -> Iterator[float]:
@@ -99,6 +106,9 @@ def fixed(fitted: Fitted, k: int, value: float, **limits: int) -> Fitted:
     tight = replace(parameter, start=value, sd=1e-4)
     parameters = (*problem.parameters[:k], tight, *problem.parameters[k + 1 :])
     start = fitted.point.copy()
+    if parameter.name == "stiffness":
+        layers = sum(each.name == "stiffness" for each in parameters)
+        start = at_same_curvature(parameters, start, (value - start[k]) / layers)
     start[k] = value
     return fit(
         Problem(problem.scenario, parameters, problem.replay), fitted.criterion, start, fitted.noise, **limits

@@ -20,6 +20,7 @@ from flexneedle.types import Floats
 
 NAMES = ("stiffness", "bevel", "guide", "clearance", "yield", "drift")
 _FIRST_YIELD = 0.2  # of the outer diameter of the needle
+_CURVATURE = 0.75  # power of the stiffness in the curvature of a free path (docs/theory.md eq. 10)
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,14 @@ _MAKERS = {
 def _yield_of(scenario: Scenario) -> float | None:
     values = [each for layer in scenario.tissue if (each := getattr(layer, "yield_mm", None)) is not None]
     return min(values, default=None)
+
+
+def at_same_curvature(parameters: Sequence[Parameter], point: Floats, log_factor: float) -> Floats:
+    """Return a point whose bevel gives a free path the same curvature with a stiffness changed by e^log_factor."""
+    bevel = np.array([each.name == "bevel" for each in parameters])
+    found = point.copy()
+    found[: len(parameters)][bevel] *= math.exp(-_CURVATURE * log_factor)
+    return found
 
 
 def trial_of(scenario: Scenario, parameters: Sequence[Parameter], point: Floats) -> Trial:

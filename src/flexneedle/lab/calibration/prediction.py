@@ -14,6 +14,8 @@ from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Flags, Floats
 
 _AIR_MM = 1.0  # from the start of the model to the skin, and to the first step, at least
 _LONGEST_MM = 1.0  # advance in a step of the model
+STEEP = 0.5
+"""Turn of a needle (rad) up to which it is fitted: the model's angles are small, and its curvature 40 % off there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +100,21 @@ class Replay:
             for depth, one, tip in zip(self.depths, self.recordings, tips, strict=True)
         )
         return replace(self, depths=depths)
+
+
+def shallow(session: Session) -> Session:
+    """Return the session with each insertion up to the step from which the needle has turned by more than `STEEP`."""
+    return replace(session, recordings=tuple(one.first(_shallow_steps(one)) for one in session.recordings))
+
+
+def _shallow_steps(one: Recording) -> int:
+    """Return the number of steps, at least two, before the needle turns too far; single outliers do not count."""
+    advance = np.maximum(np.abs(np.gradient(one.depth)), _LONGEST_MM)[:, None]
+    course = np.gradient(one.position, axis=0) / advance
+    turn = np.where(np.isfinite(one.slope), one.slope - one.slope[0], course)
+    steep = np.linalg.norm(turn, axis=1) > STEEP
+    lasting = np.flatnonzero(steep[:-1] & steep[1:])
+    return len(steep) if not len(lasting) else max(2, int(lasting[0]))
 
 
 def fitting_scenario(scenario: Scenario, session: Session) -> Scenario:

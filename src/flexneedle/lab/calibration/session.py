@@ -63,11 +63,24 @@ class Recording:
         """Largest distance (mm) of the guide from its first position."""
         return float(np.linalg.norm(self.guide - self.guide[0], axis=1).max())
 
+    @property
+    def rests(self) -> bool:
+        """Whether guide and base rest."""
+        base = np.linalg.norm(self.base - self.base[0], axis=1).max()
+        return bool(max(self.guide_moves, base) < _STILL)
+
     @cached_property
     def moved(self) -> Flags:
         """Whether guide, base or roll moved (k,) since the step before."""
         change = np.column_stack([self.guide, self.base, self.roll])
         return np.append(False, (np.abs(np.diff(change, axis=0)) > _STILL).any(axis=1))
+
+    def first(self, count: int) -> "Recording":
+        """Return the first steps of the insertion."""
+        kept: dict[str, Any] = {
+            name: getattr(self, name)[:count] for name in ("time", "depth", "roll", *_NUMBERS)
+        }
+        return replace(self, **kept)
 
     def __repr__(self) -> str:
         return (

@@ -84,8 +84,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         from flexneedle.lab.calibration.picture import save_profile
 
         print(f"Profile: {save_profile(found, args.profile, args.out)}")
-    for problem in found.problems:
-        print_note(problem)
+    for line in (*found.notes, *found.problems):
+        print_note(line)
     return 1 if found.problems else 0
 
 
