@@ -1,4 +1,4 @@
-"""Validation of the exact plant: writes docs/validation.md and its figures.
+"""Validation of the exact plant: writes docs/validation.md and its figures, up to the part of studies/recorded.py.
 
     python studies/validation.py [--out DIR]
 
@@ -23,6 +23,8 @@ from reference import validation as problems
 from reference.cases import EI, FOUNDATION
 from validation_figures import draw
 
+RECORDED = "\n## Against recordings"
+"""Beginning of the part that studies/recorded.py writes, and this script keeps."""
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -48,7 +50,7 @@ def power(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndar
 def document(found: results.Found) -> str:
     """Return the text of docs/validation.md."""
     parts = [
-        "# Validation of the exact plant",
+        "# Validation",
         INTRODUCTION,
         summary(found),
         *needle(found),
@@ -73,7 +75,8 @@ INTRODUCTION = (
     "`python studies/validation.py` (`make validation`) compares the needle of the virtual phantom (`--phantom exact`,"
     " [theory](theory.md), section 11) with closed forms, a second solver and the controller's model. It writes this"
     " page; the tests assert its values (`pytest tests/phantom`). The page verifies that the equations are solved"
-    " correctly; only an experiment can validate the tissue law and contact rules that plant and model share."
+    " correctly; the tissue law and contact rules that plant and model share are compared with"
+    " [recorded insertions](#against-recordings) at the end."
 )
 
 
@@ -291,7 +294,9 @@ def write(found: results.Found, folder: Path) -> list[Path]:
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     page = folder / "validation.md"
-    page.write_text(document(found), encoding="utf-8")
+    old = page.read_text(encoding="utf-8") if page.exists() else ""
+    recorded = "".join(old.partition(RECORDED)[1:])
+    page.write_text(document(found) + recorded, encoding="utf-8")
     return [page, *draw(found, images)]
 
 

@@ -221,7 +221,7 @@ class Period:
     true_stretch: float | None = None  # minimum stretch λ of the true tissue until now
     miss: Lateral = UNKNOWN  # predicted lateral miss y, z at the target (mm); NaN: not predicted
     miss_sd: float = math.nan  # its standard deviation on an axis (mm)
-    warning: str = ""  # warning of a likely miss, or ""
+    warning: str = ""  # warning of a likely miss, or of readings that contradict the scenario; or ""
     predicted: Shape | None = None  # shape at the target; None: not predicted
     true_shape: Floats | None = None  # points x, y, z (n, 3) at equal distances along the needle (mm)
     readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first

@@ -233,6 +233,21 @@ def test_where_the_start_along_the_axis_is_known_it_is_not_fitted():
     assert abs(estimate.axial) < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("needle", "known", "named"),
+    [
+        (Needle(modulus=(6.0, 1.0)), {"bevel_sd": 0.1}, "the modulus of superficial is"),
+        (Needle(bevel=3.0), {"modulus_log_sd": 0.1, "variation_sd": 0.1}, "the bevel offset is 2"),
+        (Needle(modulus=(1.2, 0.9), bevel=1.1), {}, ""),
+    ],
+)
+def test_readings_that_contradict_the_scenario_are_named(needle, known, named):
+    settings = {f"control.adaptive_mpc.{key}": value for key, value in known.items()}
+    estimate, _ = followed(needle, 40, scenario=PHANTOM.with_values(settings))
+    assert estimate.doubt.startswith(f"the readings contradict the scenario: {named}" if named else "")
+    assert bool(estimate.doubt) is bool(named)
+
+
 # ---- rest
 
 

@@ -84,6 +84,17 @@ def test_a_likely_miss_gives_a_warning_and_no_hold(plan, miss, sd, warned):
     assert set(recorded) == {((miss, 0.0), sd)}
 
 
+def test_a_doubt_of_the_controller_is_a_warning(plan):
+    def decide(_task, memory, _estimate, _rng):
+        return Decision(Control(db_x=1.0), "straight", doubt="softer than expected"), memory
+
+    recorded = RecordedPhantom(plan.roll, scenario=PHANTOM)
+    doubting = Controller("doubting", "inserts straight", decide=decide)
+    done = run(in_air(plan), recorded.rig(), PHANTOM, controller=doubting, force=True)
+    assert done.outcome == "done"
+    assert done.warning == "softer than expected"
+
+
 def test_a_miss_in_space_is_recorded_with_its_direction(plan):
     done, _ = inserted(in_air(plan), [0.3 - 0.4j])
     assert {period.miss for period in moving(done)} == {(0.3, -0.4)}

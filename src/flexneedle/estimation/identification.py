@@ -14,8 +14,9 @@ and added as a constant.
 """
 
 import cmath
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import takewhile
 
 import numpy as np
@@ -40,6 +41,8 @@ from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
 from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Point, X, Z
 
+_DOUBTED = 3.5  # standard deviations
+_TOLD = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
 _RECENT = 12  # moves whose residuals are low-passed
 
 
@@ -196,6 +199,37 @@ class Identified(FittedInsertion):
         """Standard deviation of the factor on the bevel offset, relative to it."""
         k = self.slots.bevel
         return float(np.sqrt(self.covariance[k, k]) / max(self.parameters[k], LEAST_SD))
+
+    @cached_property
+    def doubt(self) -> str:
+        """What the readings say against the scenario's moduli and bevel, or "".
+
+        A posterior mean minus the prior's is a normal variable, whose variance is the prior's minus the posterior's.
+        """
+        known, worst, doubt = np.linalg.inv(self.prior.precision), _DOUBTED, ""
+        for name, weights in self._compared():
+            off = float(weights @ (self.parameters - self.prior.mean))
+            before, after = float(weights @ known @ weights), float(weights @ self.covariance @ weights)
+            if after < _TOLD * before and abs(off) > worst * np.sqrt(before - after):
+                worst = abs(off) / np.sqrt(before - after)
+                factor = 1.0 + off if weights[self.slots.bevel] else float(np.exp(off))
+                doubt = f"the readings contradict the scenario: {name} is {factor:.2g} times its value there"
+        return doubt
+
+    def _compared(self) -> Iterator[tuple[str, Floats]]:
+        """Yield the mean ln of each layer's modulus above the tip, and the bevel, as weights (K,) of the parameters."""
+        tissue, slots = self.nominal.scenario.tissue, self.slots
+        unit, tops = np.eye(self.parameters.size), (*self.nominal.scenario.layer_tops, np.inf)
+        cells = slots.modulus + 2 * len(tissue) - 1
+        for k, layer in enumerate(tissue):
+            starts = self.prior.begins[cells:]
+            inside = (starts >= tops[k]) & (starts < min(tops[k + 1], float(self.state.tip[X])))
+            if inside.any():
+                yield (
+                    f"the modulus of {layer.name}",
+                    unit[slots.modulus + k] + unit[cells:][inside].mean(axis=0),
+                )
+        yield "the bevel offset", unit[slots.bevel]
 
     @property
     def lag(self) -> float:

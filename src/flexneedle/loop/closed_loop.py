@@ -116,7 +116,8 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         state = _advance(decided, step, observation, steering, begun, now)
         ending = _ending(task, state)
         period = _make_period(index, now, task, rig, step, motion.control, observation, clocks)
-        yield replace(period, warning=warn_of_miss(step.decision, state.in_a_row)), ending
+        warning = warn_of_miss(step.decision, state.in_a_row) or step.decision.doubt
+        yield replace(period, warning=warning), ending
         if ending is not None:
             return
 

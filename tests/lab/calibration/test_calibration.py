@@ -12,7 +12,7 @@ from flexneedle.lab.calibration.criteria import Likelihood, PredictionErrors
 from flexneedle.lab.calibration.files import read_record, write_calibration
 from flexneedle.lab.calibration.fit import Problem, fit, residuals_at
 from flexneedle.lab.calibration.parameters import make_needle, parameters_of, trial_of
-from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
+from flexneedle.lab.calibration.prediction import STEEP, Replay, fitting_scenario, shallow
 from flexneedle.lab.calibration.session import Session
 from flexneedle.scenario.files import load_scenario
 from simulated_session import AXIS, blank, simulate, without_slopes
@@ -89,6 +89,55 @@ def test_the_bevel_is_fitted_at_the_scenarios_stiffness_if_that_is_unknown():
     assert "stiffness of gel" in found.unidentified
     bevel = load_scenario("gel").needle.bevel.offset_mm
     assert np.linalg.norm(found.trial.bevel) == pytest.approx(bevel, rel=0.08)
+
+
+def test_without_motion_of_the_guide_no_stiffness_is_identified():
+    """However precisely the entry is measured."""
+    found = calibrate("gel", simulate(4, resting=4, seed=5, noise=1e-3), ("stiffness", "bevel"))
+    assert "stiffness of gel" in found.unidentified
+    assert found.trial.stiffness[0] == pytest.approx(1.0, abs=1e-3)
+    assert not any("contradict" in note for note in found.notes)
+
+
+def turning(slope):
+    """Return a recording with these slopes (k,) along y, and a path to match."""
+    slope = np.array(slope)
+    guide = np.zeros((len(slope), 1))
+    return replace(
+        blank("a", "0", guide, 5.0 * np.arange(len(slope))),
+        slope=slope[:, None],
+        position=np.append(0.0, np.cumsum(5.0 * slope[1:]))[:, None],
+    )
+
+
+def test_steps_of_a_needle_that_has_turned_far_are_not_fitted():
+    rising = np.linspace(0.0, 2.0 * STEEP, 13)
+    (cut,) = shallow(Session((turning(rising),))).recordings
+    assert len(cut.depth) == len(cut.slope) == len(cut.guide) == 7
+    (unmeasured,) = shallow(without_slopes(Session((turning(rising),)))).recordings
+    assert len(unmeasured.depth) == pytest.approx(7, abs=1)
+    single = np.where(np.arange(13) == 5, 3.0 * STEEP, 0.0)
+    (kept,) = shallow(Session((turning(single),))).recordings
+    assert len(kept.depth) == 13
+    (shortest,) = shallow(Session((turning(1.0 + rising - (np.arange(13) == 0)),))).recordings
+    assert len(shortest.depth) == 2
+
+
+def test_it_says_that_steps_are_not_used(guided):
+    first, *others = guided.recordings
+    bent = replace(first, slope=first.slope + np.where(np.arange(len(first.depth)) > 8, 1.0, 0.0)[:, None])
+    found = calibrate("gel", replace(guided, recordings=(bent, *others)), ("bevel",))
+    assert found.notes[0].startswith("4 of 65 steps are not used: the needle has turned by more than 0.5 rad")
+
+
+def test_a_value_that_the_recordings_contradict_is_not_kept(guided, monkeypatch):
+    """Even if they do not determine it."""
+    monkeypatch.setattr("flexneedle.lab.calibration.intervals._NORMAL", 1e3)
+    far = load_scenario("gel").with_values({"tissue.0.shear_modulus_kpa": 66.0})
+    found = calibrate(far, guided, ("stiffness", "bevel"))
+    assert "stiffness of gel" in found.unidentified
+    assert np.log(found.trial.stiffness[0]) == pytest.approx(np.log(10.0), abs=0.3)
+    assert found.notes[0].startswith("stiffness of gel: the recordings do not determine it, but contradict")
 
 
 def mirrored(session):

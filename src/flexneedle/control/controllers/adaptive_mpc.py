@@ -153,7 +153,8 @@ def decide(
     why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
     after = Memory(path, rolled, fitted.state.roll, memory.scale, memory.loads, outlook, lever, rests)
-    return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples), after
+    doubt = fitted.doubt
+    return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples, doubt), after
 
 
 def _describe_rolls(path: GuidePath, axes: int) -> str:

@@ -30,8 +30,7 @@ from scipy.optimize import minimize
 from flexneedle.types import Flags, Floats
 
 KINDS = ("heading", "lateral", "turn", "response", "shift", "curvature", "gain", "position", "slope")
-"""Kinds of errors, in the order of their standard deviations."""
-_UNITS = ("rad/√mm", "mm/√mm", "1", "1", "mm", "1/mm", "1", "mm", "rad")
+"""Kinds of errors, in the order of their standard deviations: rad/√mm, mm/√mm, 1, 1, mm, 1/mm, 1, mm, rad."""
 GAIN_KINDS = (5, 6)
 """Kinds of errors that an insertion has as a whole."""
 _INTERVALS = 5  # kinds with a factor for each interval
@@ -70,12 +69,6 @@ class Noise:
         sd = self.sd.copy()
         sd[[*kinds]] = 0.0
         return Noise(sd)
-
-    def __str__(self) -> str:
-        pairs = zip(KINDS, self.sd, _UNITS, strict=True)
-        return ", ".join(
-            f"{kind} {value:.3g}{'' if unit == '1' else f' {unit}'}" for kind, value, unit in pairs
-        )
 
 
 @dataclass(frozen=True, eq=False)

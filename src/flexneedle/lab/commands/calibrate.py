@@ -78,7 +78,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         print_json(read_record(args.out) or {})
     else:
         print_table("", ("parameter", "value", "95 %"), found.table())
-        print(f"Errors of the model and of readings: {found.final.noise}")
+        position, slope = found.final.noise.sd[-2:].tolist()
+        print(f"Errors of readings: {position:.2g} mm, {1e3 * slope:.2g} mrad")
         print(f"\nScenario: {args.out}")
     if args.profile is not None:
         from flexneedle.lab.calibration.picture import save_profile
