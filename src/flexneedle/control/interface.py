@@ -44,7 +44,7 @@ class Decision:
         rest: Time (s) for which the needle rests, instead of the command, so that late readings arrive.
         predicted: Shape of the needle at the target, None if it is not predicted; not compared.
         samples: Samples of the search, None without one; not compared.
-        doubt: A warning of what the readings say against the scenario.
+        doubt: Warning that the readings contradict the scenario.
 
     Raises:
         InputError: Another command, a value of another type, or a number that is negative or not finite where it may

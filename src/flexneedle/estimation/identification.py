@@ -202,7 +202,7 @@ class Identified(FittedInsertion):
 
     @cached_property
     def doubt(self) -> str:
-        """What the readings say against the scenario's moduli and bevel, or "".
+        """A line if the readings contradict the scenario's moduli or bevel, else "".
 
         A posterior mean minus the prior's is a normal variable, whose variance is the prior's minus the posterior's.
         """

@@ -166,7 +166,7 @@ class Calibration:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know about the fit, besides `problems`."""
+        """Lines on steps that are not used, and on values that the recordings contradict."""
         return tuple(self._find_notes())
 
     def _find_notes(self) -> Iterator[str]:
@@ -275,10 +275,10 @@ def _starts(problem: Problem, yields: Sequence[float] = (1.0,)) -> Iterator[Floa
 
 
 def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
-    """Return the fit with what the data do not identify at the start's values, and the intervals of all parameters.
+    """Return the fit with what the data do not identify at the scenario's values, and the intervals of all parameters.
 
     One parameter is fixed at a time, the least identified first: another may be identified once it is. A parameter
-    stays free if the data contradict its value at the start.
+    stays free if the data contradict its value in the scenario.
     """
     found: dict[str, Interval] = {}
     while True:
@@ -290,7 +290,7 @@ def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
         widths = {each.label: each.useful for each in fitted.problem.parameters}
         worst = max(open_ones, key=lambda label: (now[label].high - now[label].low) / widths[label])
         k = labels.index(worst)
-        without = fixed(fitted, k, fitted.problem.parameters[k].start)
+        without = fixed(fitted, k, fitted.problem.parameters[k].own)
         refuted = without.cost - fitted.cost > SAME_COST and fitted.problem.moves
         found[worst] = replace(now[worst], refuted=refuted)
         fitted = fitted if refuted else without

@@ -20,6 +20,7 @@ from flexneedle.types import Floats
 
 NAMES = ("stiffness", "bevel", "guide", "clearance", "yield", "drift")
 _FIRST_YIELD = 0.2  # of the outer diameter of the needle
+_NONE = 1e-2  # from the bound that stands for none
 _CURVATURE = 0.75  # power of the stiffness in the curvature of a free path (docs/theory.md eq. 10)
 
 
@@ -30,13 +31,14 @@ class Parameter:
     Attributes:
         name: Its name; several may have one, such as the axes of the bevel.
         label: Its label in tables.
-        start: Its value in the scenario, in the coordinate of the fit: the logarithm of a positive quantity.
-        sd: Standard deviation of its prior, which is centred at `start`.
+        start: Mean of its prior, in the coordinate of the fit: the logarithm of a positive quantity.
+        sd: Standard deviation of its prior.
         low, high: Bounds.
         step: Step of a finite difference.
         useful: Half of a 95 % interval from which the parameter counts as not identified.
         log: Whether the coordinate is a logarithm.
         unit: Unit of its value.
+        absent: Whether the scenario has no value; then the upper bound stands for none.
     """
 
     name: str
@@ -49,6 +51,12 @@ class Parameter:
     useful: float
     log: bool = True
     unit: str = ""
+    absent: bool = False
+
+    @property
+    def own(self) -> float:
+        """Its value in the scenario."""
+        return self.high if self.absent else self.start
 
     def value(self, coordinate: float) -> float:
         """Return the value of a coordinate."""
@@ -114,10 +122,12 @@ def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
 
 
 def _yield(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
-    first = math.log(_yield_of(scenario) or _FIRST_YIELD * scenario.needle.outer_diameter)
+    known = _yield_of(scenario)
+    first = math.log(known or _FIRST_YIELD * scenario.needle.outer_diameter)
     low, high = math.log(0.02), math.log(min(layer.compression_length_mm for layer in scenario.tissue) * 0.69)
+    first, useful, absent = min(first, high), math.log(4.0), known is None
     yield Parameter(
-        "yield", "displacement that tears", min(first, high), 0.75, low, high, 0.05, math.log(4.0), True, "mm"
+        "yield", "displacement that tears", first, 0.75, low, high, 0.05, useful, True, "mm", absent
     )
 
 
@@ -148,6 +158,8 @@ def trial_of(scenario: Scenario, parameters: Sequence[Parameter], point: Floats)
     """Return the values of all parameters at a point (p,) of the fit; the scenario's for those that are not fitted."""
     found: dict[str, list[float]] = {}
     for parameter, coordinate in zip(parameters, point.tolist(), strict=True):
+        if parameter.absent and coordinate > parameter.high - _NONE:
+            continue
         found.setdefault(parameter.name, []).append(parameter.value(coordinate))
     stiffness = np.ones(len(scenario.tissue))
     factors = found.get("stiffness", [])
