@@ -65,7 +65,9 @@ def test_a_model_that_lacks_something_is_fitted_by_its_predictions():
     session = simulate(
         4, resting=1, noise=0.002, seed=4, **{"tissue.0.law": "tearing", "tissue.0.yield_mm": 0.1}
     )
-    assert calibrate("gel", session, ("stiffness", "bevel")).fitted.criterion is PredictionErrors
+    found = calibrate("gel", session, ("stiffness", "bevel"))
+    assert found.fitted.criterion is PredictionErrors
+    assert found.notes == ("the tissue seems to tear, which the model lacks: fit yield, too",)
 
 
 def test_the_scenario_has_the_values_and_priors(fitted):
@@ -89,6 +91,25 @@ def test_the_bevel_is_fitted_at_the_scenarios_stiffness_if_that_is_unknown():
     assert "stiffness of gel" in found.unidentified
     bevel = load_scenario("gel").needle.bevel.offset_mm
     assert np.linalg.norm(found.trial.bevel) == pytest.approx(bevel, rel=0.08)
+
+
+def test_a_yield_that_is_not_identified_is_none_where_the_scenario_has_none(guided, monkeypatch):
+    monkeypatch.setattr("flexneedle.lab.calibration.intervals._NORMAL", 1e3)
+    found = calibrate("gel", guided, ("bevel", "yield"))
+    assert found.trial.yield_mm is None
+    assert found.scenario.tissue[0].law == "ogden"
+
+
+def test_a_fitted_guide_is_no_farther_than_the_needle_allows(guided):
+    """The stroke of the scenario is shortened for it."""
+    scenario = load_scenario("gel").with_values({"setup.guide_to_skin_mm": 17.0})
+    room = scenario.needle.length_mm - 17.0 + scenario.setup.tip_to_skin_mm
+    tight = scenario.with_values({"setup.stroke_mm": room - 0.5})
+    found = calibrate(tight, guided, ("stiffness", "bevel", "guide"))
+    assert found.trial.guide_mm == pytest.approx(18.0, rel=0.03)
+    assert found.scenario.setup.stroke_mm < room - 0.5
+    (guide,) = (each for each in found.parameters if each.name == "guide")
+    assert guide.value(guide.high) + 60.0 < scenario.needle.length_mm
 
 
 def test_without_motion_of_the_guide_no_stiffness_is_identified():

@@ -166,7 +166,7 @@ class Calibration:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Lines on steps that are not used, and on values that the recordings contradict."""
+        """Lines on steps that are not used, values that the recordings contradict, and tissue that tears."""
         return tuple(self._find_notes())
 
     def _find_notes(self) -> Iterator[str]:
@@ -179,14 +179,30 @@ class Calibration:
                 f"{steps - used} of {steps} steps are not used: the needle has turned by more than {STEEP:g} rad, too "
                 "far for the model"
             )
-        for each in self.parameters:
-            if self.intervals[each.label].refuted:
-                value = each.value(float(self.final.point[self.parameters.index(each)]))
-                shown = f"{value:.2g} {each.unit}".rstrip()
+        for each, point in zip(self.parameters, self.final.point.tolist(), strict=False):
+            shown = f"{each.value(point):.2g} {each.unit}".rstrip()
+            if each.absent and each.label in self.unidentified and not each.is_none(point):
+                yield f"{each.label}: not determined; the calibrated scenario has {shown}, as in recorded gels"
+            elif self.intervals[each.label].refuted:
                 yield (
                     f"{each.label}: the recordings do not determine it, but contradict the scenario's value; the "
                     f"calibrated scenario has {shown}, which fits best"
                 )
+
+        if self._tears():
+            yield "the tissue seems to tear, which the model lacks: fit yield, too"
+
+    def _tears(self) -> bool:
+        """Return whether a model that lacks something predicts the recordings better with a yield."""
+        fitted = self.fitted
+        fits_yield = any(each.name == "yield" for each in self.parameters)
+        if fitted.criterion is not PredictionErrors or fits_yield or not fitted.problem.moves:
+            return False
+        problem, reached = fitted.problem, fitted.problem.replay.reached
+        (torn,) = parameters_of(problem.scenario, ("yield",), reached)
+        start = np.insert(fitted.point, len(self.parameters), torn.start)
+        wider = replace(problem, parameters=(*self.parameters, torn))
+        return fitted.cost - fit(wider, PredictionErrors, start, fitted.noise).cost > SAME_COST
 
     def profile(self, name: str, count: int = 9) -> Profile:
         """Return the profile of a parameter, by its name or its label. Raises InputError for another."""
@@ -235,8 +251,8 @@ def calibrate(
     loaded = load_scenario(scenario)
     used = shallow(session)
     prepared = fitting_scenario(loaded, used)
-    reached = max(float(one.depth.max()) for one in used.recordings)
-    problem = Problem(prepared, parameters_of(prepared, fit, reached), Replay.of(used))
+    replay = Replay.of(used)
+    problem = Problem(prepared, parameters_of(prepared, fit, replay.reached), replay)
     best, others = _minimize(problem)
     free = _identify(best)
     return Calibration(loaded, session, best, others, *free)
@@ -274,11 +290,16 @@ def _starts(problem: Problem, yields: Sequence[float] = (1.0,)) -> Iterator[Floa
         yield np.clip(start, *problem.bounds)
 
 
+def _cost(fitted: Fitted) -> float:
+    return fitted.cost
+
+
 def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
     """Return the fit with what the data do not identify at the scenario's values, and the intervals of all parameters.
 
     One parameter is fixed at a time, the least identified first: another may be identified once it is. A parameter
-    stays free if the data contradict its value in the scenario.
+    stays free if the data contradict its value in the scenario. Where the scenario has no value, none or the prior's
+    mean is taken, whichever fits better.
     """
     found: dict[str, Interval] = {}
     while True:
@@ -290,7 +311,8 @@ def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
         widths = {each.label: each.useful for each in fitted.problem.parameters}
         worst = max(open_ones, key=lambda label: (now[label].high - now[label].low) / widths[label])
         k = labels.index(worst)
-        without = fixed(fitted, k, fitted.problem.parameters[k].own)
+        parameter = fitted.problem.parameters[k]
+        without = min((fixed(fitted, k, value) for value in {parameter.own, parameter.start}), key=_cost)
         refuted = without.cost - fitted.cost > SAME_COST and fitted.problem.moves
         found[worst] = replace(now[worst], refuted=refuted)
         fitted = fitted if refuted else without

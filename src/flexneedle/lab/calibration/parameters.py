@@ -20,6 +20,7 @@ from flexneedle.types import Floats
 
 NAMES = ("stiffness", "bevel", "guide", "clearance", "yield", "drift")
 _FIRST_YIELD = 0.2  # of the outer diameter of the needle
+_BEHIND_MM = 1.0  # of the needle behind the guide at the deepest step and at the target, at least
 _NONE = 1e-2  # from the bound that stands for none
 _CURVATURE = 0.75  # power of the stiffness in the curvature of a free path (docs/theory.md eq. 10)
 
@@ -57,6 +58,10 @@ class Parameter:
     def own(self) -> float:
         """Its value in the scenario."""
         return self.high if self.absent else self.start
+
+    def is_none(self, coordinate: float) -> bool:
+        """Return whether a coordinate stands for no value."""
+        return self.absent and coordinate > self.high - _NONE
 
     def value(self, coordinate: float) -> float:
         """Return the value of a coordinate."""
@@ -106,12 +111,15 @@ def _bevel(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
         )
 
 
-def _guide(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
+def _guide(scenario: Scenario, reached: float) -> Iterator[Parameter]:
     if scenario.setup.guide_to_skin_mm is None:
         raise InputError("fit = guide: the scenario has no guide (setup.guide_to_skin_mm)")
     first = math.log(scenario.setup.guide_to_skin_mm)
     low = max(first - 1.0, math.log(scenario.setup.tip_to_skin_mm) + 1e-3)  # the tip starts before the guide
-    yield Parameter("guide", "guide to skin", first, 0.1, low, first + 1.0, 0.02, math.log(1.35), True, "mm")
+    deepest = max(reached, scenario.target.depth_mm)
+    longest = max(scenario.needle.length_mm - deepest - _BEHIND_MM, scenario.setup.guide_to_skin_mm)
+    high = min(first + 1.0, math.log(longest))
+    yield Parameter("guide", "guide to skin", first, 0.1, low, high, 0.02, math.log(1.35), True, "mm")
 
 
 def _clearance(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
@@ -158,7 +166,7 @@ def trial_of(scenario: Scenario, parameters: Sequence[Parameter], point: Floats)
     """Return the values of all parameters at a point (p,) of the fit; the scenario's for those that are not fitted."""
     found: dict[str, list[float]] = {}
     for parameter, coordinate in zip(parameters, point.tolist(), strict=True):
-        if parameter.absent and coordinate > parameter.high - _NONE:
+        if parameter.is_none(coordinate):
             continue
         found.setdefault(parameter.name, []).append(parameter.value(coordinate))
     stiffness = np.ones(len(scenario.tissue))
@@ -189,9 +197,18 @@ def with_trial(scenario: Scenario, trial: Trial) -> Scenario:
     }
     changes["needle.bevel.offset_mm"] = float(np.linalg.norm(trial.bevel))
     if trial.guide_mm is not None:
-        changes["setup.guide_to_skin_mm"] = trial.guide_mm
+        changes |= _with_guide(scenario, trial.guide_mm)
         changes["setup.guide_clearance_mm"] = trial.clearance_mm
     return _with_yield(scenario, trial.yield_mm).with_values(changes)
+
+
+def _with_guide(scenario: Scenario, guide_mm: float) -> dict[str, object]:
+    """Return the changes for a distance of the guide; a stroke with which the base would reach it is shortened."""
+    room = scenario.needle.length_mm - guide_mm + scenario.setup.tip_to_skin_mm
+    return {
+        "setup.guide_to_skin_mm": guide_mm,
+        "setup.stroke_mm": min(scenario.setup.stroke_mm, room * (1.0 - 1e-9)),
+    }
 
 
 def _with_yield(scenario: Scenario, yield_mm: float | None) -> Scenario:
@@ -223,7 +240,7 @@ def make_needle(scenario: Scenario, trial: Trial) -> Needle:
     """Return the needle of a trial."""
     changed = _with_yield(scenario, trial.yield_mm)
     if trial.guide_mm is not None:
-        changed = changed.with_values({"setup.guide_to_skin_mm": trial.guide_mm})
+        changed = changed.with_values(_with_guide(scenario, trial.guide_mm))
     simulator, size = Simulator(changed), float(np.linalg.norm(trial.bevel))
     model = simulator.adapt(
         Adaptation(np.zeros(len(trial.stiffness) - 1), trial.stiffness, clearance=trial.clearance_mm)

@@ -42,6 +42,11 @@ class Replay:
         """Lateral axes."""
         return self.recordings[0].axes
 
+    @property
+    def reached(self) -> float:
+        """Depth (mm) of the deepest step."""
+        return max(float(one.depth.max()) for one in self.recordings)
+
     @cached_property
     def begin(self) -> float:
         """Depth at which all insertions start in the model, in air."""
