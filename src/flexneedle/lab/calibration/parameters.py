@@ -21,7 +21,7 @@ from flexneedle.types import Floats
 NAMES = ("stiffness", "bevel", "guide", "clearance", "yield", "drift")
 _FIRST_YIELD = 0.2  # of the outer diameter of the needle
 _BEHIND_MM = 1.0  # of the needle behind the guide at the deepest step and at the target, at least
-_NONE = 1e-2  # from the bound that stands for none
+_NONE = 1e-2  # from the bound that means none
 _CURVATURE = 0.75  # power of the stiffness in the curvature of a free path (docs/theory.md eq. 10)
 
 
@@ -39,7 +39,7 @@ class Parameter:
         useful: Half of a 95 % interval from which the parameter counts as not identified.
         log: Whether the coordinate is a logarithm.
         unit: Unit of its value.
-        absent: Whether the scenario has no value; then the upper bound stands for none.
+        absent: Whether the scenario has no value; then the upper bound means none.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Parameter:
         return self.high if self.absent else self.start
 
     def is_none(self, coordinate: float) -> bool:
-        """Return whether a coordinate stands for no value."""
+        """Return whether a coordinate means no value."""
         return self.absent and coordinate > self.high - _NONE
 
     def value(self, coordinate: float) -> float:
