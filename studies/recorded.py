@@ -116,14 +116,16 @@ def document(halves: Sequence[Half], command: str) -> str:
         f" to {deep:g} mm. Simple predictors have the same training insertions; the regression knows the motion of the"
         " guide.",
         by_distance(found),
-        *found.verdict,
+        found.verdict[0],
+        "\n".join(f"- {wrapped(line)}" for line in found.verdict[1:-1]),
+        found.verdict[-1],
         "![Errors of predictions ahead](images/recordings-errors.png)",
         "The slope of the tip responds to a motion of the guide near the skin, and hardly where the needle is deep:",
         "![Response of the slope over depth](images/recordings-response.png)",
         f"Values by halves, with the median error {AHEAD:g} mm ahead of guided predictions; lengths in mm:",
         by_session(halves),
     ]
-    return "\n\n".join(wrapped(part) for part in parts) + "\n"
+    return "\n\n".join(part if part.startswith("-") else wrapped(part) for part in parts) + "\n"
 
 
 def write(halves: Sequence[Half], folder: Path, command: str) -> list[Path]:

@@ -65,7 +65,10 @@ def intervals(fitted: Fitted, *, check_far: bool = True) -> list[Interval]:
     found = []
     for k, (value, width) in enumerate(zip(fitted.point[:size].tolist(), widths.tolist(), strict=True)):
         near = 1e-3 * (high[k] - low[k])
-        bound = "lower" if value - low[k] < near else "upper" if high[k] - value < near else ""
+        # A clearance of 0 is a result.
+        bound = (
+            "lower" if low[k] != 0.0 and value - low[k] < near else "upper" if high[k] - value < near else ""
+        )
         found.append(
             Interval(
                 value,
