@@ -41,7 +41,7 @@ class Half:
     found: Validation
 
 
-def split(session: Session) -> Iterator[tuple[str, Session, Session]]:
+def halves_of(session: Session) -> Iterator[tuple[str, Session, Session]]:
     """Yield the halves of each session: name, insertions to calibrate, insertions to predict."""
     for part in map(session.of, session.names):
         yield "even", part.even, part.odd
@@ -50,7 +50,7 @@ def split(session: Session) -> Iterator[tuple[str, Session, Session]]:
 
 def predict_all(session: Session, scenario: str, fit: Sequence[str], jobs: int) -> Iterator[Half]:
     """Yield both halves of all sessions."""
-    work = list(split(session))
+    work = list(halves_of(session))
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         calibrations = pool.map(partial(flexneedle.calibrate, scenario, fit=fit), [each[1] for each in work])
         for n, (fitted, (name, training, test)) in enumerate(zip(calibrations, work, strict=True), 1):
@@ -100,9 +100,8 @@ def by_session(halves: Sequence[Half]) -> str:
     return table(("calibrated half", *labels, "model (mm)", "regression (mm)"), lines)
 
 
-def document(halves: Sequence[Half], command: str) -> str:
+def document(halves: Sequence[Half], found: Validation, command: str) -> str:
     """Return the part of the page."""
-    found = join(halves)
     sessions = len({half.session for half in halves})
     _, deep = depth_limits(found.deepest)
     parts = [
@@ -128,7 +127,7 @@ def document(halves: Sequence[Half], command: str) -> str:
     return "\n\n".join(part if part.startswith("-") else wrapped(part) for part in parts) + "\n"
 
 
-def write(halves: Sequence[Half], folder: Path, command: str) -> list[Path]:
+def write(text: str, found: Validation, folder: Path) -> list[Path]:
     """Write the part into validation.md, in place of an earlier one, and its figures; return the paths."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -136,8 +135,8 @@ def write(halves: Sequence[Half], folder: Path, command: str) -> list[Path]:
     before = (
         page.read_text(encoding="utf-8").partition(RECORDED)[0].rstrip() + "\n\n" if page.exists() else ""
     )
-    page.write_text(before + document(halves, command), encoding="utf-8")
-    found, paths = join(halves), [page]
+    page.write_text(before + text, encoding="utf-8")
+    paths = [page]
     for name, figure in {"errors": draw_overview(found), "response": draw_response(found)}.items():
         if figure is not None:
             paths.append(images / f"recordings-{name}.png")
@@ -158,8 +157,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     halves = list(predict_all(load_session(args.session), args.scenario, args.fit, args.jobs))
     command = f"python studies/recorded.py SESSION {args.scenario} --fit {' '.join(args.fit)}"
-    print(document(halves, command))
-    for path in write(halves, args.out, command):
+    found = join(halves)
+    text = document(halves, found, command)
+    print(text)
+    for path in write(text, found, args.out):
         print(path)
 
 

@@ -42,7 +42,7 @@ from flexneedle.estimation.task import Task
 from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Point, X, Z
 
 _DOUBTED = 3.5  # standard deviations
-_TOLD = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
+_KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
 _RECENT = 12  # moves whose residuals are low-passed
 
 
@@ -206,15 +206,20 @@ class Identified(FittedInsertion):
 
         A posterior mean minus the prior's is a normal variable, whose variance is the prior's minus the posterior's.
         """
-        known, worst, doubt = np.linalg.inv(self.prior.precision), _DOUBTED, ""
+        ratio, name, factor = max(self._compare())
+        if ratio < _DOUBTED:
+            return ""
+        return f"the readings contradict the scenario: {name} is {factor:.2g} times its value there"
+
+    def _compare(self) -> Iterator[tuple[float, str, float]]:
+        """Yield for each of `_compared` its deviation in standard deviations, 0 if little is known; name, factor."""
         for name, weights in self._compared():
             off = float(weights @ (self.parameters - self.prior.mean))
-            before, after = float(weights @ known @ weights), float(weights @ self.covariance @ weights)
-            if after < _TOLD * before and abs(off) > worst * np.sqrt(before - after):
-                worst = abs(off) / np.sqrt(before - after)
-                factor = 1.0 + off if weights[self.slots.bevel] else float(np.exp(off))
-                doubt = f"the readings contradict the scenario: {name} is {factor:.2g} times its value there"
-        return doubt
+            before, after = (
+                float(weights @ each @ weights) for each in (self.prior.covariance, self.covariance)
+            )
+            ratio = abs(off) / np.sqrt(before - after) if after < _KNOWN * before else 0.0
+            yield ratio, name, 1.0 + off if weights[self.slots.bevel] else float(np.exp(off))
 
     def _compared(self) -> Iterator[tuple[str, Floats]]:
         """Yield the mean ln of each layer's modulus above the tip, and the bevel, as weights (K,) of the parameters."""

@@ -6,6 +6,7 @@ layers, ln of a further factor on the modulus in cells along the depth, correlat
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -146,6 +147,12 @@ class Prior:
         starts = settings.cell_mm * np.arange(cells)
         begins = np.concatenate([[-np.inf] * slots.bevel, [0.0, -np.inf], tops, tops[1:], starts])
         return Prior(mean, precision, bounds, steps, begins)
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance (K, K)."""
+        found: Floats = np.linalg.inv(self.precision).astype(np.float64)
+        return found
 
     def cost(self, parameters: Floats) -> float:
         """Return the negative logarithm of the density, up to a constant."""

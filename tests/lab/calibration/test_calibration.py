@@ -67,7 +67,7 @@ def test_a_model_that_lacks_something_is_fitted_by_its_predictions():
     )
     found = calibrate("gel", session, ("stiffness", "bevel"))
     assert found.fitted.criterion is PredictionErrors
-    assert found.notes == ("the tissue seems to tear, which the model lacks: fit yield, too",)
+    assert found.notes[-1] == "the tissue seems to tear: fit yield, too"
 
 
 def test_the_scenario_has_the_values_and_priors(fitted):
@@ -112,12 +112,71 @@ def test_a_fitted_guide_is_no_farther_than_the_needle_allows(guided):
     assert guide.value(guide.high) + 60.0 < scenario.needle.length_mm
 
 
-def test_without_motion_of_the_guide_no_stiffness_is_identified():
-    """However precisely the entry is measured."""
-    found = calibrate("gel", simulate(4, resting=4, seed=5, noise=1e-3), ("stiffness", "bevel"))
-    assert "stiffness of gel" in found.unidentified
+def test_without_motion_of_the_guide_only_the_bevel_is_identified():
+    """However precisely the entry is measured; the bevel has no prior, since it belongs to the stiffness."""
+    found = calibrate(
+        "gel", simulate(4, resting=4, seed=5, noise=1e-3), ("stiffness", "bevel", "guide", "yield")
+    )
+    assert set(found.unidentified) == {"stiffness of gel", "guide to skin", "displacement that tears"}
     assert found.trial.stiffness[0] == pytest.approx(1.0, abs=1e-3)
     assert not any("contradict" in note for note in found.notes)
+    assert any("holds for the scenario's stiffness only" in note for note in found.notes)
+    assert dict(found._priors()) == {}
+
+
+def test_two_insertions_are_too_few_for_an_interval(guided):
+    found = calibrate("gel", guided.select([n in (1, 2) for n in range(5)]), ("stiffness",))
+    assert "intervals are too narrow: from fewer than 3 insertions" in found.notes
+
+
+@pytest.fixture
+def stopped(fitted):
+    """Return a function that gives the problems of the calibration with changes of its fits."""
+
+    def problems(**changes):
+        fits = {name: replace(fitted.fitted, **changes) for name in ("fitted", "final")}
+        return replace(fitted, **fits).problems
+
+    return problems
+
+
+def test_a_fit_that_has_stopped_early_is_reported(fitted, stopped):
+    point, sd = fitted.fitted.point, np.sqrt(np.diag(np.linalg.inv(fitted.fitted.information)))
+    assert stopped() == ()
+    assert stopped(settled=False) == ("the fit did not settle",)
+    far = fitted.fitted.errors + fitted.fitted.slopes @ (3.0 * sd * (np.arange(len(sd)) == 0))
+    assert stopped(errors=far) == ("the fit did not settle",)
+    assert stopped(residuals=replace(fitted.fitted.residuals, converged=False)) == (
+        "some steps of the model did not converge",
+    )
+    start = fitted.fitted.problem.start
+    assert "the fit did not move from its start" in stopped(point=start)
+    other = replace(fitted.fitted, point=point + 5.0 * sd * (np.arange(len(sd)) == 0))
+    (line,) = replace(fitted, others=(other,)).problems
+    assert line.startswith("two minima fit alike: stiffness of gel = ")
+    assert replace(fitted, others=(replace(other, cost=other.cost + 10.0),)).problems == ()
+
+
+def test_a_bound_is_reported():
+    session = simulate(3, resting=1, seed=3, **STIFF)
+    far = load_scenario("gel").with_values({"tissue.0.shear_modulus_kpa": 660.0 / 3e3})
+    found = calibrate(far, session, ("stiffness", "bevel"))
+    assert any(line.startswith("stiffness of gel is at its upper bound, 1000") for line in found.problems)
+
+
+def test_the_prior_is_that_of_the_layer_that_is_known_least(guided):
+    """One parameter of the controller holds for all layers."""
+    (gel,) = load_scenario("gel").values()["tissue"]
+    layers = [gel | {"name": "skin", "thickness_mm": 10.0}, gel]
+    found = calibrate(load_scenario("gel").with_values({"tissue": layers}), guided, ("stiffness",))
+    skin = found.intervals["stiffness of skin"]
+    wide = replace(skin, low=skin.value - 1.0, high=skin.value + 1.0, identified=True)
+    known = replace(found, intervals=found.intervals | {"stiffness of skin": wide})
+    assert dict(known._priors())["control.adaptive_mpc.modulus_log_sd"] == pytest.approx(1.0 / 1.96, rel=0.1)
+    unknown = replace(
+        found, intervals=found.intervals | {"stiffness of skin": replace(wide, identified=False)}
+    )
+    assert dict(unknown._priors()) == {}
 
 
 def turning(slope):
@@ -239,7 +298,18 @@ def test_parameters_that_cannot_be_fitted_are_refused(guided):
         calibrate("gel", guided, ("colour",))
     free = load_scenario("gel").with_values({"setup.guide_to_skin_mm": None})
     with pytest.raises(InputError, match=r"fit = guide: the scenario has no guide"):
-        calibrate(free, guided, ("guide",))
+        calibrate(free, simulate(2, resting=2), ("guide",))
+    with pytest.raises(
+        InputError, match=r"setup\.guide_to_skin_mm: missing: the guide moves in the recordings"
+    ):
+        calibrate(free, guided, ("bevel",))
+    short = load_scenario("gel").with_values(
+        {"needle.length_mm": 80.0, "setup.stroke_mm": 50.0, "target.depth_mm": 30.0}
+    )
+    with pytest.raises(
+        InputError, match=r"needle\.length_mm = 80: too short for recordings to 60\.0 mm and 20 mm"
+    ):
+        calibrate(short, guided, ("bevel",))
     with pytest.raises(InputError, match="session: has no recordings"):
         calibrate("gel", Session(()), ("bevel",))
 
@@ -251,7 +321,7 @@ def test_the_files_of_a_calibration_are_read_again(fitted, tmp_path):
     assert path.read_text().startswith("# Calibrated from gel with 5 recorded insertions of a.")
     record = read_record(path)
     assert record["fit"] == ["stiffness", "bevel", "guide"]
-    assert len(record["insertions"]) == 5
+    assert record["insertions"] == [list(one.key) for one in fitted.session.recordings]
 
 
 def test_a_profile_has_its_minimum_at_the_fit(fitted):

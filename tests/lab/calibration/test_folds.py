@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from hashlib import sha256
 from types import SimpleNamespace
 
 import numpy as np
@@ -45,7 +46,8 @@ def fits(monkeypatch):
         made = object.__new__(Calibration)
         for name, value in {"start": start, "session": part, "fitted": None, "others": ()}.items():
             object.__setattr__(made, name, value)
-        made.__dict__.update(scenario=scenario, trial=SimpleNamespace(drift=0.01 * len(found)))
+        trial = SimpleNamespace(drift=0.01 * len(found))
+        made.__dict__.update(scenario=scenario, trial=trial, problems=("it is stuck",))
         return made
 
     monkeypatch.setattr(Calibration, "parameters", (SimpleNamespace(name="bevel"),))
@@ -53,16 +55,18 @@ def fits(monkeypatch):
     return SimpleNamespace(calls=found, calibrate=calibrate)
 
 
-def write(path, insertions):
+def write(path, used, **changes):
+    text = f"# Calibrated from gel\n{dump_scenario(GEL)}"
     record = {
-        "format": 1, "start": GEL.values(), "fit": ["bevel", "drift"], "insertions": sorted(insertions),
+        "format": 1, "start": GEL.values(), "fit": ["bevel", "drift"],
+        "insertions": [one.key for one in used.recordings], "sha256": sha256(text.encode()).hexdigest(),
         "parameters": {
             "bevel": {"value": 1.0, "identified": True},
-            "drift from insertion to insertion": {"value": -0.02, "identified": True},
+            "drift (ln stiffness per insertion)": {"value": -0.02, "identified": True},
         },
     }  # fmt: skip
-    path.write_text(dump_scenario(GEL))
-    path.with_suffix(".calibration.json").write_text(json.dumps(record))
+    path.write_text(text)
+    path.with_suffix(".calibration.json").write_text(json.dumps(record | changes))
     return path
 
 
@@ -85,7 +89,7 @@ def test_given_training_insertions_train_and_all_others_test():
 
 def test_the_insertions_of_a_fit_train(tmp_path, fits):
     every = session(5, 2)
-    for given in (write(tmp_path / "a.toml", keys(every.even)), fits.calibrate(GEL, every.even, ())):
+    for given in (write(tmp_path / "a.toml", every.even), fits.calibrate(GEL, every.even, ())):
         found = split(given, every, None)
         assert_apart(found, every.odd)
         assert keys(found.folds[0].training) == keys(every.even)
@@ -95,7 +99,7 @@ def test_the_insertions_of_a_fit_train(tmp_path, fits):
 
 def test_a_fit_of_all_insertions_is_repeated_on_each_half(tmp_path, fits):
     every = session(5, 2)
-    found = split(write(tmp_path / "a.toml", keys(every)), every, None)
+    found = split(write(tmp_path / "a.toml", every), every, None)
     assert_apart(found, every)
     assert [(keys(part), names) for _, part, names in fits.calls] == [
         (keys(half), ("bevel", "drift")) for half in (every.even, every.odd)
@@ -105,6 +109,7 @@ def test_a_fit_of_all_insertions_is_repeated_on_each_half(tmp_path, fits):
     assert found.sentence.startswith(
         "All 7 insertions were used in the fit: the fit was repeated on each half"
     )
+    assert found.sentence.endswith("; it is stuck")
     # A part of the insertions of the fit, too, is never predicted by a fit to it.
     part = every.of("a")
     assert_apart(split(tmp_path / "a.toml", part, None), part)
@@ -113,7 +118,7 @@ def test_a_fit_of_all_insertions_is_repeated_on_each_half(tmp_path, fits):
 
 def test_a_record_of_other_insertions_is_no_training(tmp_path, fits):
     every = session(4)
-    found = split(write(tmp_path / "a.toml", {("x", "1")}), every, None)
+    found = split(write(tmp_path / "a.toml", session(0, 4)), every, None)
     assert_apart(found, every)
     assert not fits.calls
     assert found.sentence.startswith("The scenario was not fitted to these insertions")
@@ -122,7 +127,7 @@ def test_a_record_of_other_insertions_is_no_training(tmp_path, fits):
 def test_the_name_of_a_preset_is_no_path_of_a_record(tmp_path, monkeypatch):
     every = session(4)
     monkeypatch.chdir(tmp_path)
-    write(tmp_path / "gel.toml", keys(every.even))
+    write(tmp_path / "gel.toml", every.even)
     assert len(split("gel", every, None).folds) == 2
     assert len(split("gel.toml", every, None).folds) == 1
 
@@ -136,10 +141,33 @@ def test_too_few_insertions_are_refused():
 
 
 def test_a_damaged_record_is_one_line(tmp_path):
-    path = write(tmp_path / "a.toml", keys(session(2)))
-    path.with_suffix(".calibration.json").write_text('{"format": 1, "start": {}, "fit": []}')
+    path = write(tmp_path / "a.toml", session(2), start={})
     with pytest.raises(InputError, match="record"):
         split(path, session(2), None)
+
+
+def test_a_calibrated_scenario_without_its_record_is_refused(tmp_path):
+    """Its insertions could not be kept out of the test."""
+    path = write(tmp_path / "a.toml", session(2))
+    copy = path.rename(tmp_path / "noext")
+    with pytest.raises(InputError, match=r"noext\.calibration\.json: missing: the record"):
+        split(copy, session(2), None)
+
+
+def test_a_scenario_that_has_changed_since_its_fit_is_refused(tmp_path):
+    path = write(tmp_path / "a.toml", session(2))
+    path.write_text(path.read_text().replace("330", "3"))
+    with pytest.raises(InputError, match="has changed since its fit: calibrate again, from it"):
+        split(path, session(2), None)
+
+
+def test_other_insertions_with_the_names_of_the_fit_test(tmp_path):
+    """As of another day in a folder with the same name."""
+    again = session(3)
+    for one in again.recordings:
+        one.depth[:] += 1.0
+    found = split(write(tmp_path / "a.toml", session(3)), again, None)
+    assert found.sentence.startswith("The scenario was not fitted to these insertions")
 
 
 def test_each_session_is_trained_by_its_own_insertions_else_by_all():

@@ -1,18 +1,21 @@
-"""Calibration: a scenario fitted to recorded insertions, with intervals, and what the data do not say."""
+"""Calibration: a scenario fitted to recorded insertions, with intervals, and what it does not identify."""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from flexneedle.errors import InputError
 from flexneedle.lab.calibration.criteria import Criterion, Likelihood, PredictionErrors
 from flexneedle.lab.calibration.deviations import KINDS
+from flexneedle.lab.calibration.findings import find_notes, find_problems
 from flexneedle.lab.calibration.fit import Fitted, Problem, fit, reading_share
 from flexneedle.lab.calibration.intervals import SAME_COST, Interval, fixed, intervals, profile
 from flexneedle.lab.calibration.parameters import (
@@ -23,7 +26,7 @@ from flexneedle.lab.calibration.parameters import (
     trial_of,
     with_trial,
 )
-from flexneedle.lab.calibration.prediction import STEEP, Replay, fitting_scenario, shallow
+from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
 from flexneedle.lab.calibration.session import Session
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -34,14 +37,11 @@ _FACTORS = (1.0, 0.1, 10.0, 100.0)
 """On the stiffness, from which fits start."""
 _YIELDS = (0.3,)
 """Factors on the yield, likewise."""
-_OTHER_POINT = 3.0  # distance in standard deviations of two minima
 _READINGS = 0.1  # share of errors of readings from which the likelihood is used; recorded gels: below 0.01
 _FIRST_ROUNDS = 2  # until the noise decides on the criterion
 _PROFILED = 1.5  # half-widths of the interval, to either side
-_MOVED = 1e-3  # of the prior's standard deviation
 _ADVICE = {
     "stiffness": "move the guide by ±{guide:g} mm at depths of {depths} mm",
-    "bevel": "insert with the guide at rest, to {reached:.0f} mm or deeper",
     "guide": "move the guide by ±{guide:g} mm at depths of {depths} mm",
     "clearance": "move the guide to and fro by {guide:g} mm with the tip near the skin",
     "yield": "move the guide by ±{guide:g} and ±{more:g} mm at depths of {depths} mm",
@@ -68,6 +68,7 @@ class Calibration:
         others: The fits from other starts.
         final: The fit with parameters that the data do not identify at their values in the scenario.
         intervals: Intervals of 95 % by label, in the coordinates of the fit.
+        tears: Whether a model that lacks something predicts the recordings better with tissue that tears.
     """
 
     start: Scenario
@@ -76,6 +77,7 @@ class Calibration:
     others: tuple[Fitted, ...]
     final: Fitted
     intervals: dict[str, Interval]
+    tears: bool
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -87,7 +89,7 @@ class Calibration:
         """Parameters that the data do not identify, by label, each with the experiment that would."""
         deepest = max(float(one.depth.max()) for one in self.session.recordings)
         values = {
-            "guide": 3.0, "more": 6.0, "reached": deepest,
+            "guide": 3.0, "more": 6.0,
             "depths": ", ".join(f"{share * deepest:.0f}" for share in (0.15, 0.3, 0.5)),
         }  # fmt: skip
         return {
@@ -112,18 +114,24 @@ class Calibration:
         return with_trial(self.start, self.trial).with_values(dict(self._priors()))
 
     def _priors(self) -> Iterator[tuple[str, float]]:
-        """Yield the priors of the controller: interval, and variation from insertion to insertion."""
+        """Yield the priors of the controller: interval, and variation from insertion to insertion.
+
+        A bevel that belongs to a stiffness which is not identified has none.
+        """
         gain = float(self.final.noise.sd[KINDS.index("gain")])
-        found = {each.name: each for each in self.parameters if each.label not in self.unidentified}
-        if "stiffness" in found:
-            sd = self._sd(found["stiffness"])
-            yield "control.adaptive_mpc.modulus_log_sd", round(float(np.hypot(sd, gain)), 3)
-        if "bevel" in found:
-            size = float(np.linalg.norm(self.trial.bevel))
-            sd = self._sd(found["bevel"]) / max(size, 1e-3)
+        found: dict[str, list[float]] = {}
+        for each in self.parameters:
+            sd = np.inf if each.label in self.unidentified else self._sd(each)
+            found.setdefault(each.name, []).append(sd)
+        modulus = max(found.get("stiffness", [np.inf]))
+        if np.isfinite(modulus):
+            yield "control.adaptive_mpc.modulus_log_sd", round(float(np.hypot(modulus, gain)), 3)
+        if "bevel" in found and not np.isinf(found.get("stiffness", [0.0])).any():
+            size = max(float(np.linalg.norm(self.trial.bevel)), 1e-3)
+            sd = float(np.linalg.norm(found["bevel"] * self.trial.bevel)) / size**2
             yield "control.adaptive_mpc.bevel_sd", round(float(np.clip(np.hypot(sd, gain), 0.05, 1.0)), 3)
-        if "clearance" in found:
-            yield "control.adaptive_mpc.clearance_sd_mm", round(self._sd(found["clearance"]), 4)
+        if np.isfinite(clearance := max(found.get("clearance", [np.inf]))):
+            yield "control.adaptive_mpc.clearance_sd_mm", round(clearance, 4)
 
     def _sd(self, parameter: Parameter) -> float:
         """Return the standard deviation of a parameter in its coordinate."""
@@ -133,76 +141,16 @@ class Calibration:
     @cached_property
     def problems(self) -> tuple[str, ...]:
         """Reasons not to trust the fit: not settled or converged, at a bound, not moved, two minima."""
-        return tuple(self._find_problems())
-
-    def _find_problems(self) -> Iterator[str]:
-        point, sd = self.fitted.point, self.fitted.problem.sd
-        if not self.final.settled:
-            yield "the fit did not settle"
-        if not self.final.residuals.converged:
-            yield "some steps of the model did not converge"
-        for each, interval in zip(self.parameters, self.intervals.values(), strict=True):
-            if interval.bound and (interval.identified or interval.refuted):
-                value = f"{each.value(interval.value):.4g} {each.unit}".rstrip()
-                yield f"{each.label} is at its {interval.bound} bound, {value}"
-        size = len(self.parameters)
-        if size and (np.abs(point - self.fitted.problem.start)[:size] < _MOVED * sd[:size]).all():
-            yield "the fit did not move from its start"
-        yield from self._find_minima()
-
-    def _find_minima(self) -> Iterator[str]:
-        """Yield a problem if another minimum fits alike, not only along what is not identified."""
-        size, point = len(self.parameters), self.fitted.point
-        open_ones = np.array([each.label in self.unidentified for each in self.parameters])
-        scale = np.sqrt(np.diag(np.linalg.inv(self.fitted.information)))[:size]
-        for other in self.others:
-            apart = np.abs(other.point - point)[:size] / scale
-            alike = other.settled and other.cost - self.fitted.cost < SAME_COST
-            if alike and apart.max() > _OTHER_POINT and not (apart[open_ones] > 1.0).any():
-                k = int(apart.argmax())
-                here, there = (self.parameters[k].value(float(each[k])) for each in (point, other.point))
-                yield f"two minima fit alike: {self.parameters[k].label} = {here:.4g} or {there:.4g}"
-                break
+        return tuple(find_problems(self))
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Lines on steps that are not used, values that the recordings contradict, and tissue that tears."""
-        return tuple(self._find_notes())
+        """Lines on data that are not used, values that the recordings do not determine, and tissue that tears."""
+        return tuple(find_notes(self))
 
-    def _find_notes(self) -> Iterator[str]:
-        used, steps = (
-            sum(len(one.depth) for one in recordings)
-            for recordings in (self.fitted.problem.replay.recordings, self.session.recordings)
-        )
-        if used < steps:
-            yield (
-                f"{steps - used} of {steps} steps are not used: the needle has turned by more than {STEEP:g} rad, too "
-                "far for the model"
-            )
-        for each, point in zip(self.parameters, self.final.point.tolist(), strict=False):
-            shown = f"{each.value(point):.2g} {each.unit}".rstrip()
-            if each.absent and each.label in self.unidentified and not each.is_none(point):
-                yield f"{each.label}: not determined; the calibrated scenario has {shown}, as in recorded gels"
-            elif self.intervals[each.label].refuted:
-                yield (
-                    f"{each.label}: the recordings do not determine it, but contradict the scenario's value; the "
-                    f"calibrated scenario has {shown}, which fits best"
-                )
-
-        if self._tears():
-            yield "the tissue seems to tear, which the model lacks: fit yield, too"
-
-    def _tears(self) -> bool:
-        """Return whether a model that lacks something predicts the recordings better with a yield."""
-        fitted = self.fitted
-        fits_yield = any(each.name == "yield" for each in self.parameters)
-        if fitted.criterion is not PredictionErrors or fits_yield or not fitted.problem.moves:
-            return False
-        problem, reached = fitted.problem, fitted.problem.replay.reached
-        (torn,) = parameters_of(problem.scenario, ("yield",), reached)
-        start = np.insert(fitted.point, len(self.parameters), torn.start)
-        wider = replace(problem, parameters=(*self.parameters, torn))
-        return fitted.cost - fit(wider, PredictionErrors, start, fitted.noise).cost > SAME_COST
+    def __repr__(self) -> str:
+        values = ", ".join(f"{label} {value}" for label, value, _ in self.table())
+        return f"<Calibration with {len(self.session.recordings)} insertions: {values}>"
 
     def profile(self, name: str, count: int = 9) -> Profile:
         """Return the profile of a parameter, by its name or its label. Raises InputError for another."""
@@ -253,9 +201,9 @@ def calibrate(
     prepared = fitting_scenario(loaded, used)
     replay = Replay.of(used)
     problem = Problem(prepared, parameters_of(prepared, fit, replay.reached), replay)
-    best, others = _minimize(problem)
-    free = _identify(best)
-    return Calibration(loaded, session, best, others, *free)
+    with threadpool_limits(1, user_api="blas"):  # the matrices are small: more threads wait for each other
+        best, others = _minimize(problem)
+        return Calibration(loaded, session, best, others, *_identify(best), _tears(best))
 
 
 def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
@@ -265,7 +213,7 @@ def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
     errors.
     """
     coarse = [fit(problem, Likelihood, start, rounds=1) for start in _starts(problem)]
-    lead, *others = sorted(coarse, key=lambda each: each.cost)
+    lead, *others = sorted(coarse, key=attrgetter("cost"))
     first = fit(problem, Likelihood, lead.point, lead.noise, rounds=_FIRST_ROUNDS)
     criterion: type[Criterion]
     if reading_share(first) > _READINGS:
@@ -273,7 +221,7 @@ def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:
     else:
         criterion, starts = PredictionErrors, [problem.start, first.point, *_starts(problem, _YIELDS)]
     best, *rest = sorted(
-        (fit(problem, criterion, start, first.noise) for start in starts), key=lambda each: each.cost
+        (fit(problem, criterion, start, first.noise) for start in starts), key=attrgetter("cost")
     )
     return best, tuple(rest)
 
@@ -290,8 +238,16 @@ def _starts(problem: Problem, yields: Sequence[float] = (1.0,)) -> Iterator[Floa
         yield np.clip(start, *problem.bounds)
 
 
-def _cost(fitted: Fitted) -> float:
-    return fitted.cost
+def _tears(fitted: Fitted) -> bool:
+    """Return whether a model that lacks something predicts the recordings better with a yield."""
+    problem = fitted.problem
+    fits_yield = any(each.name == "yield" for each in problem.parameters)
+    if fitted.criterion is not PredictionErrors or fits_yield or not problem.moves:
+        return False
+    (torn,) = parameters_of(problem.scenario, ("yield",), problem.replay.reached)
+    start = np.insert(fitted.point, len(problem.parameters), torn.start)
+    wider = replace(problem, parameters=(*problem.parameters, torn))
+    return fitted.cost - fit(wider, PredictionErrors, start, fitted.noise).cost > SAME_COST
 
 
 def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
@@ -304,7 +260,7 @@ def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
     found: dict[str, Interval] = {}
     while True:
         labels = [each.label for each in fitted.problem.parameters]
-        now = dict(zip(labels, intervals(fitted, check_far=not found), strict=True))
+        now = dict(zip(labels, intervals(fitted), strict=True))
         open_ones = [label for label in labels if label not in found and not now[label].identified]
         if not open_ones:
             return fitted, now | found
@@ -312,7 +268,9 @@ def _identify(fitted: Fitted) -> tuple[Fitted, dict[str, Interval]]:
         worst = max(open_ones, key=lambda label: (now[label].high - now[label].low) / widths[label])
         k = labels.index(worst)
         parameter = fitted.problem.parameters[k]
-        without = min((fixed(fitted, k, value) for value in {parameter.own, parameter.start}), key=_cost)
+        without = min(
+            (fixed(fitted, k, value) for value in {parameter.own, parameter.start}), key=attrgetter("cost")
+        )
         refuted = without.cost - fitted.cost > SAME_COST and fitted.problem.moves
         found[worst] = replace(now[worst], refuted=refuted)
         fitted = fitted if refuted else without

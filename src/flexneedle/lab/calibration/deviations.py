@@ -8,6 +8,7 @@ with independent disturbances (a, b) in each interval. Their variances are estim
 
     heading     a random walk of the heading, per mm of advance
     lateral     a random walk across the path, per mm of advance
+    turn        an error of the heading in proportion to the turn v that the model predicts
     response    an error in proportion to the lateral motion and the turn (u, v) that the model predicts beyond a
                 straight continuation, such as by a motion of the guide
     shift       a lateral error in proportion to the predicted turn
@@ -55,7 +56,7 @@ TAIL = 4.0
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations (8,) of the errors, by `KINDS`."""
+    """Standard deviations (9,) of the errors, by `KINDS`."""
 
     sd: Floats
 
@@ -121,7 +122,7 @@ class Deviations:
         return blocks
 
     def unit_covariances(self, factors: Floats) -> Floats:
-        """Return covariances (8, 2 k, 2 k) of e and ξ by `KINDS`, for standard deviations of 1; the last two are noise.
+        """Return covariances (9, 2 k, 2 k) of e and ξ by `KINDS`, for standard deviations of 1; the last two are noise.
 
         factors (k,): on the variances of each interval.
         """
@@ -164,7 +165,7 @@ class Whitened:
 
     @cached_property
     def parts(self) -> Floats:
-        """Covariances (8, r, r) by `KINDS` of the r known values."""
+        """Covariances (9, r, r) by `KINDS` of the r known values."""
         found: Floats = self.deviations.unit_covariances(self.factors)[:, self.known][:, :, self.known]
         return found
 

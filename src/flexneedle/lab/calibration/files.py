@@ -1,7 +1,7 @@
 """The files of a calibration: a scenario with a comment of its origin, and a record for `validate`."""
 
 import json
-import math
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from flexneedle.record.folder import versions
 from flexneedle.scenario.files import dump_scenario
 
 _FORMAT = 1
+_BEGINNING = "# Calibrated from "
 
 
 def record_path(scenario: Path) -> Path:
@@ -22,20 +23,19 @@ def record_path(scenario: Path) -> Path:
 def write_calibration(found: Calibration, path: Path, source: str) -> None:
     """Write the calibrated scenario, and the record beside it. source: the scenario from which the fit started."""
     lines = [
-        f"# Calibrated from {source} with {len(found.session.recordings)} recorded insertions of "
+        f"{_BEGINNING}{source} with {len(found.session.recordings)} recorded insertions of "
         f"{', '.join(found.session.names)}."
     ]
-    lines += [f"# {label}: {value} (95 %: {interval})" for label, value, interval in found.table()]
-    if found.scenario.setup.axes == 2:
-        lines.append(
-            f"# Direction of the bevel in the recordings: {math.degrees(found.direction):.0f}° from y towards z."
-        )
+    for label, value, interval in found.table():
+        lines.append(f"# {label}: {value} ({'' if label in found.unidentified else '95 %: '}{interval})")
     lines += [f"# Note: {note}" for note in found.notes]
     lines += [f"# WARNING: {problem}" for problem in found.problems]
     text = "\n".join(line.replace("\n", " ") for line in lines)
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, f"{text}\n\n{dump_scenario(found.scenario)}".encode())
-    replace_file(record_path(path), (json.dumps(_record(found, source), indent=1) + "\n").encode())
+    data = f"{text}\n\n{dump_scenario(found.scenario)}".encode()
+    replace_file(path, data)
+    record = {**_record(found, source), "sha256": sha256(data).hexdigest()}
+    replace_file(record_path(path), (json.dumps(record, indent=1) + "\n").encode())
 
 
 def _record(found: Calibration, source: str) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def _record(found: Calibration, source: str) -> dict[str, Any]:
         "source": source,
         "start": found.start.values(),
         "fit": list(dict.fromkeys(each.name for each in found.parameters)),
-        "insertions": [[one.session, one.name] for one in found.session.recordings],
+        "insertions": [one.key for one in found.session.recordings],
         "parameters": {
             each.label: {
                 "value": each.value(interval.value),
@@ -64,14 +64,23 @@ def _record(found: Calibration, source: str) -> dict[str, Any]:
 
 
 def read_record(scenario: Path) -> dict[str, Any] | None:
-    """Return the record beside a scenario, None if there is none. Raises InputError for another format."""
-    path = record_path(scenario)
+    """Return the record beside a calibrated scenario, None for another one.
+
+    Raises InputError if it is missing, has another format, or the scenario has changed since its fit.
+    """
+    path, data = record_path(scenario), scenario.read_bytes()
+    if not data.startswith(_BEGINNING.encode()):
+        return None
     try:
         record: Any = json.loads(path.read_text())
     except FileNotFoundError:
-        return None
+        raise InputError(
+            f"{path}: missing: the record of the calibration belongs beside {scenario}"
+        ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
         raise InputError(f"{path}: not a record of this version: format must be {_FORMAT}")
+    if record.get("sha256") != sha256(data).hexdigest():
+        raise InputError(f"{scenario}: has changed since its fit: calibrate again, from it")
     return dict(record)

@@ -165,14 +165,26 @@ class Fitted:
         return found
 
     @cached_property
+    def gradient(self) -> Floats:
+        """Half of the negative gradient (p + s,) of the loss at the point."""
+        found: Floats = self.slopes.T @ self.errors + (self.problem.start - self.point) / self.problem.sd**2
+        return found
+
+    @property
+    def left(self) -> Floats:
+        """Step (p + s,) of Gauss–Newton that is left to the minimum, in standard deviations of each parameter."""
+        covariance = np.linalg.inv(self.information)
+        found: Floats = covariance @ self.gradient / np.sqrt(np.diag(covariance))
+        return found
+
+    @cached_property
     def without(self) -> Floats:
         """Points (n, p + s) without one recording each: one step of Gauss–Newton from the point."""
-        gradient = self.slopes.T @ self.errors + (self.problem.start - self.point) / self.problem.sd**2
         moves = []
         for n in range(len(self.problem.replay.recordings)):
             rows = self.groups == n
             less = self.information - self.slopes[rows].T @ self.slopes[rows]
-            moves.append(np.linalg.solve(less, gradient - self.slopes[rows].T @ self.errors[rows]))
+            moves.append(np.linalg.solve(less, self.gradient - self.slopes[rows].T @ self.errors[rows]))
         found: Floats = self.point + np.array(moves)
         return found
 

@@ -12,7 +12,7 @@ from flexneedle.lab.calibration.session import Session
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 
-Key = tuple[str, str]
+Key = tuple[str, str, str]
 
 
 class Fold(NamedTuple):
@@ -75,9 +75,9 @@ def _source_of(given: Calibration | Scenario | str | Path) -> _Source:
             lambda part: calibrate(given.start, part, names),
         )
     scenario = load_scenario(given)
-    record = (
-        None if isinstance(given, Scenario) or Path(given).suffix != ".toml" else read_record(Path(given))
-    )
+    record = None
+    if not isinstance(given, Scenario) and Path(given).is_file():
+        record = read_record(Path(given))
     return _Source(scenario) if record is None else _recorded(scenario, record)
 
 
@@ -88,7 +88,9 @@ def _recorded(scenario: Scenario, record: dict[str, Any]) -> _Source:
             Scenario.from_values(record["start"], "record of the calibration"),
             tuple(record["fit"]),
         )
-        used = frozenset((str(session), str(name)) for session, name in record["insertions"])
+        used = frozenset(
+            (str(session), str(name), str(steps)) for session, name, steps in record["insertions"]
+        )
         fitted = [each for label, each in record["parameters"].items() if label.startswith("drift")]
         drift = sum(each["value"] for each in fitted if each["identified"])
     except (KeyError, TypeError, ValueError) as error:
@@ -97,7 +99,7 @@ def _recorded(scenario: Scenario, record: dict[str, Any]) -> _Source:
 
 
 def _keys(session: Session) -> list[Key]:
-    return [(one.session, one.name) for one in session.recordings]
+    return [one.key for one in session.recordings]
 
 
 def _those(session: Session, keys: frozenset[Key]) -> Session:
@@ -116,11 +118,16 @@ def _single(source: _Source, training: Session, session: Session, which: str) ->
 def _halves(source: _Source, session: Session, why: str) -> Split:
     halves = session.even, session.odd
     _check(*halves)
-    folds = []
+    folds, problems = [], dict[str, None]()
     for training, test in (halves, halves[::-1]):
-        fitted = source if source.again is None else _source_of(source.again(training))
+        fitted = source
+        if source.again is not None:
+            again = source.again(training)
+            fitted = _source_of(again)
+            problems |= dict.fromkeys(again.problems)
         folds.append(Fold(fitted.scenario, training, test, fitted.drift))
-    return Split(tuple(folds), f"{why} (even and odd insertions of each session)")
+    warned = "".join(f"; {problem}" for problem in problems)
+    return Split(tuple(folds), f"{why} (even and odd insertions of each session){warned}")
 
 
 def _check(training: Session, test: Session) -> None:

@@ -11,12 +11,14 @@ from flexneedle.lab.calibration.parameters import at_same_curvature
 from flexneedle.types import Floats
 
 _LEVEL = 0.95
-_LEAST_RECORDINGS = 3  # for a jackknife
+LEAST_RECORDINGS = 3
+"""Insertions from which a jackknife is made."""
 _NORMAL = (
     1.96  # standard deviations; with three insertions Student's t would leave every stiffness unidentified
 )
 SAME_COST = float(chi2.ppf(_LEVEL, 1))
 """Rise of the cost up to which two values of a parameter fit alike."""
+_BY_MOTION = ("stiffness", "guide", "clearance", "yield")
 _FAR = 1.4  # distance of the points of the profile that test whether a logarithm is identified: a factor 4
 
 
@@ -48,8 +50,8 @@ def jackknife(fitted: Fitted) -> Floats:
     return covariance
 
 
-def intervals(fitted: Fitted, *, check_far: bool = True) -> list[Interval]:
-    """Return the parameters of a fit with their intervals of 95 %; check_far: also fit with far values of a stiffness.
+def intervals(fitted: Fitted) -> list[Interval]:
+    """Return the parameters of a fit with their intervals of 95 %.
 
     The variance is the sum of those by the information of data and prior and by jackknife, with Student's t: on
     synthetic insertions each alone covers 70 to 90 % (studies/calibration.py).
@@ -57,7 +59,7 @@ def intervals(fitted: Fitted, *, check_far: bool = True) -> list[Interval]:
     problem, size = fitted.problem, len(fitted.problem.parameters)
     recordings = len(problem.replay.recordings)
     variance, freedom = np.diag(np.linalg.inv(fitted.information)), 1e6
-    if recordings >= _LEAST_RECORDINGS:
+    if recordings >= LEAST_RECORDINGS:
         variance, freedom = variance + np.diag(jackknife(fitted)), recordings - 1.0
     sd = np.sqrt(variance)[:size]
     widths = sd * t.ppf(0.5 + 0.5 * _LEVEL, freedom)
@@ -74,25 +76,23 @@ def intervals(fitted: Fitted, *, check_far: bool = True) -> list[Interval]:
                 value,
                 value - width,
                 value + width,
-                _is_identified(fitted, k, _NORMAL * float(sd[k]), check_far),
+                _is_identified(fitted, k, _NORMAL * float(sd[k])),
                 bound,
             )
         )
     return found
 
 
-def _is_identified(fitted: Fitted, k: int, width: float, check_far: bool) -> bool:
+def _is_identified(fitted: Fitted, k: int, width: float) -> bool:
     """Return whether an interval is useful, and, of a stiffness, no value a factor 4 away fits as well.
 
     The prior of a length is a measurement of it; a stiffness and a bevel have very wide priors. Without motion across
-    the needle a stiffness is not identified by what a fit makes of the entry.
+    the needle the entry alone identifies nothing but the bevel.
     """
     parameter = fitted.problem.parameters[k]
-    stiffness = parameter.name == "stiffness"
-    if width > parameter.useful or (stiffness and not fitted.problem.moves):
+    if width > parameter.useful or (parameter.name in _BY_MOTION and not fitted.problem.moves):
         return False
-    far = stiffness and check_far
-    return not far or all(rise > SAME_COST for rise in _rises(fitted, k))
+    return parameter.name != "stiffness" or all(rise > SAME_COST for rise in _rises(fitted, k))
 
 
 def _rises(fitted: Fitted, k: int) -> Iterator[float]:

@@ -5,7 +5,7 @@ stiffness k₀/EI (here a factor on the moduli), and the bevel's offset times it
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -140,7 +140,8 @@ def _yield(scenario: Scenario, _reached: float) -> Iterator[Parameter]:
 
 
 def _drift(_scenario: Scenario, _reached: float) -> Iterator[Parameter]:
-    yield Parameter("drift", "drift from insertion to insertion", 0.0, 0.05, -0.3, 0.3, 0.01, 0.05, False)
+    label = "drift (ln stiffness per insertion)"
+    yield Parameter("drift", label, 0.0, 0.05, -0.3, 0.3, 0.01, 0.05, False)
 
 
 _MAKERS = {
@@ -247,8 +248,3 @@ def make_needle(scenario: Scenario, trial: Trial) -> Needle:
     )._replace(bevel_offset=size)
     direction = complex(*trial.bevel) if size > 0.0 else 1.0
     return Needle(simulator.with_model(model), float(np.angle(direction)), trial.drift)
-
-
-def describe(parameters: Sequence[Parameter], point: Floats) -> Mapping[str, float]:
-    """Return the values at a point by label."""
-    return {each.label: each.value(x) for each, x in zip(parameters, point.tolist(), strict=True)}

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from flexneedle.errors import InputError
 from flexneedle.lab.calibration.parameters import Needle
-from flexneedle.lab.calibration.session import Recording, Session
+from flexneedle.lab.calibration.session import STILL, Recording, Session
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Flags, Floats
 
@@ -125,9 +126,17 @@ def _shallow_steps(one: Recording) -> int:
 def fitting_scenario(scenario: Scenario, session: Session) -> Scenario:
     """Return the scenario with the axes of the recordings, and a stroke for their depths.
 
-    Raises ScenarioError if the needle is too short for them.
+    Raises InputError if the needle is too short for them, or the scenario lacks a guide that moves in them.
     """
     deepest = max(float(one.depth.max()) for one in session.recordings)
+    setup, length = scenario.setup, scenario.needle.length_mm
+    if deepest + (setup.guide_to_skin_mm or 0.0) > length - 1.0:
+        until = f"and {setup.guide_to_skin_mm:g} mm from skin to guide " if setup.has_guide else ""
+        raise InputError(
+            f"needle.length_mm = {length:g}: too short for recordings to {deepest:.1f} mm {until}in this scenario"
+        )
+    if not setup.has_guide and any(one.guide_moves > STILL for one in session.recordings):
+        raise InputError("setup.guide_to_skin_mm: missing: the guide moves in the recordings")
     changes: dict[str, object] = {}
     if session.axes != scenario.setup.axes:
         changes["setup.axes"] = session.axes

@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from io import BytesIO
 from itertools import groupby
 from pathlib import Path
@@ -21,7 +22,8 @@ STEPS_FILE, SESSION_FILE = "steps.parquet", "session.toml"
 GuideOrder = Literal["before", "with", "after"]
 """Motion of the guide before, with or after the advance from a step to the next."""
 _FORMAT = 1
-_STILL = 0.05  # mm or rad, up to which a stage is still
+STILL = 0.05
+"""Motion (mm or rad) up to which a stage is still."""
 _ACROSS = ("y", "z")
 _NUMBERS = ("position", "slope", "guide", "base")
 _UNITS = {"position": "mm", "slope": "rad", "guide": "mm", "base": "mm"}
@@ -58,6 +60,12 @@ class Recording:
         """Lateral axes."""
         return int(self.position.shape[1])
 
+    @cached_property
+    def key(self) -> tuple[str, str, str]:
+        """Session, name, and a hash of the steps."""
+        steps = np.column_stack([self.depth, self.position, self.guide])
+        return self.session, self.name, sha256(steps.tobytes()).hexdigest()[:12]
+
     @property
     def guide_moves(self) -> float:
         """Largest distance (mm) of the guide from its first position."""
@@ -67,13 +75,13 @@ class Recording:
     def rests(self) -> bool:
         """Whether guide and base rest."""
         base = np.linalg.norm(self.base - self.base[0], axis=1).max()
-        return bool(max(self.guide_moves, base) < _STILL)
+        return bool(max(self.guide_moves, base) < STILL)
 
     @cached_property
     def moved(self) -> Flags:
         """Whether guide, base or roll moved (k,) since the step before."""
         change = np.column_stack([self.guide, self.base, self.roll])
-        return np.append(False, (np.abs(np.diff(change, axis=0)) > _STILL).any(axis=1))
+        return np.append(False, (np.abs(np.diff(change, axis=0)) > STILL).any(axis=1))
 
     def first(self, count: int) -> "Recording":
         """Return the first steps of the insertion."""

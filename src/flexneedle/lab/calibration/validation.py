@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from flexneedle.errors import InputError
 from flexneedle.lab.calibration.calibration import Calibration
@@ -85,6 +86,10 @@ class Validation:
         whole = [row for row in self.rows if row.group == "all"]
         return headline(self.verdicts), *map(str, self.verdicts), judge_coverage(whole)
 
+    def __repr__(self) -> str:
+        ahead = ", ".join(f"{each:g}" for each in self.ahead)
+        return f"<Validation of {len(self.tested)} insertions, {ahead} mm ahead>"
+
     def plot(self) -> "Figure":
         """Return the figure of errors, coverage, and predicted beside measured paths."""
         from flexneedle.lab.calibration.validation_report.figures import draw_overview
@@ -141,8 +146,9 @@ def validate(
         raise InputError(f"ahead = {shown}: must be distances in mm above 0")
     if not session.recordings:
         raise InputError("session: has no recordings")
-    parts = split(given, session, training)
-    tested = tuple(one for fold in parts.folds for one in predict_fold(fold, distances))
+    with threadpool_limits(1, user_api="blas"):  # the matrices are small: more threads wait for each other
+        parts = split(given, session, training)
+        tested = tuple(one for fold in parts.folds for one in predict_fold(fold, distances))
     known = tuple(_known(tested, distances))
     if not known:
         raise InputError(f"ahead = {distances[0]:g}: no insertion has steps that far apart")
