@@ -24,7 +24,8 @@ from flexneedle.lab.calibration.files import write_calibration
 from flexneedle.lab.calibration.folds import Fold
 from flexneedle.lab.calibration.prediction import fitting_scenario
 from flexneedle.lab.calibration.session import Session
-from flexneedle.lab.calibration.validation import validate
+from flexneedle.lab.calibration.validation import Validation, validate
+from flexneedle.lab.calibration.validation_report.figures import draw_paths, draw_response
 from flexneedle.lab.calibration.validation_report.response import responses
 from flexneedle.lab.calibration.verdicts import (
     END,
@@ -314,6 +315,30 @@ def test_the_response_to_the_guide_is_the_model_s(found):
         assert (twice.recorded, twice.low) == pytest.approx((2.0 * one.recorded, 2.0 * one.low))
         assert twice.model == one.model
     assert abs(shown[-1].model) < abs(shown[0].model)
+
+
+def test_few_motions_of_the_guide_share_few_bins(found):
+    tested = [one for one in found.tested if one.recording.guide_moves > 0.0]
+    for insertions, bins in ((1, 2), (2, 5)):
+        few = Validation(tuple(tested[:insertions]), AHEAD, "")
+        assert len(list(responses(few.tested, few.deepest))) == bins
+        assert all(one.moves >= 8 for one in responses(few.tested, few.deepest))
+        figure = draw_response(few)
+        assert (figure is None) == (bins < 3)
+    model = next(line for line in figure.axes[0].get_lines() if line.get_label().startswith("model"))
+    assert model.get_marker() == "s"
+
+
+def test_paths_are_labelled_with_the_depth_of_their_step_and_the_guide_moves_in_its_order(found):
+    figure = draw_paths(found)
+    tip, guide = figure.axes[0], figure.axes[-1]
+    starts = [line for line in tip.get_lines() if "predicted from" in line.get_label()]
+    for line in starts:
+        assert f"predicted from {line.get_xdata()[0]:.0f} mm" in line.get_label()
+    assert "predicted from 5 mm, with 95 %" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert guide.get_lines()[0].get_drawstyle() == "steps-pre"
+    after = replace(found, tested=tuple(replace(one, guide_order="after") for one in found.tested))
+    assert draw_paths(after).axes[-1].get_lines()[0].get_drawstyle() == "steps-post"
 
 
 def test_wrong_inputs_are_one_line(session):

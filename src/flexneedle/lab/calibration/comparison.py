@@ -14,7 +14,7 @@ from flexneedle.lab.calibration.folds import Fold, sessions_of
 from flexneedle.lab.calibration.forecast import Forecast, forecast
 from flexneedle.lab.calibration.parameters import Parameter, parameters_of
 from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
-from flexneedle.lab.calibration.session import Recording, Session
+from flexneedle.lab.calibration.session import GuideOrder, Recording, Session
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Flags, Floats
 
@@ -33,6 +33,7 @@ class Tested:
 
     Attributes:
         recording: The insertion.
+        guide_order: When the guide moves between two of its steps.
         place: Its place in the session, from 0 for the first insertion to 1 for the last.
         forecast: Predictions of the model.
         simple: Simple predictors by distance ahead (mm).
@@ -40,6 +41,7 @@ class Tested:
     """
 
     recording: Recording
+    guide_order: GuideOrder
     place: float
     forecast: Forecast
     simple: Mapping[float, dict[str, Predictor]]
@@ -101,7 +103,7 @@ def predict_fold(fold: Fold, ahead: Sequence[float]) -> Iterator[Tested]:
         last = max(1, *part.training.order, *part.test.order)
         forecasts = forecast(fitted, part.test)
         for one, order, found in zip(part.test.recordings, part.test.order, forecasts, strict=True):
-            yield Tested(one, order / last, found, simple, to_end if one.rests else {})
+            yield Tested(one, part.test.guide_order, order / last, found, simple, to_end if one.rests else {})
 
 
 def fit_nuisances(scenario: Scenario, training: Session, drift: float) -> Fitted:

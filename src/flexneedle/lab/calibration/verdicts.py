@@ -1,6 +1,6 @@
 """Tables and verdict of a validation: errors by group, and the model against the best simple predictor."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flexneedle.lab.calibration.baselines import REGRESSION
 from flexneedle.lab.calibration.comparison import MODEL, Errors
-from flexneedle.types import Flags, Floats
+from flexneedle.types import Flags
 
 _SHALLOW, _DEEP = 0.2, 0.45  # limits of groups by depth, as shares of the deepest step
 _ROUND_MM = 5.0
@@ -189,20 +189,22 @@ def judge(group: str, ahead: float, errors: Errors) -> Verdict:
 
 
 def _compare(row: Row, errors: Errors, against: str) -> Comparison:
-    low, high = _interval(errors.insertion, errors.size[MODEL], errors.size[against])
-    return Comparison(against, row.median[MODEL], row.median[against], low, high)
+    ours, theirs, ends = errors.size[MODEL], errors.size[against], (0.0, np.inf)
+    if len(np.unique(errors.insertion)) >= _LEAST:
+        ends = bootstrap(
+            errors.insertion,
+            lambda drawn: float(np.median(ours[drawn])) / max(float(np.median(theirs[drawn])), _LEAST_MM),
+        )
+    return Comparison(against, row.median[MODEL], row.median[against], *ends)
 
 
-def _interval(insertion: NDArray[np.intp], ours: Floats, theirs: Floats) -> tuple[float, float]:
-    """Return the ends of the interval of the ratio of medians, by bootstrap over insertions."""
+def bootstrap(insertion: NDArray[Any], statistic: Callable[[NDArray[np.intp]], float]) -> tuple[float, float]:
+    """Return the interval of 95 % of a statistic of rows, by bootstrap over the insertions (r,) of the rows."""
     rows = [np.flatnonzero(insertion == one) for one in np.unique(insertion)]
-    if len(rows) < _LEAST:
-        return 0.0, np.inf
-    random, ratios = np.random.default_rng(0), []
-    for _ in range(_DRAWS):
-        drawn = np.concatenate([rows[k] for k in random.integers(len(rows), size=len(rows))])
-        ratios.append(np.median(ours[drawn]) / max(np.median(theirs[drawn]), _LEAST_MM))
-    low, high = np.quantile(ratios, (0.025, 0.975)).tolist()
+    random = np.random.default_rng(0)
+    drawn = (random.integers(len(rows), size=len(rows)) for _ in range(_DRAWS))
+    found = [statistic(np.concatenate([rows[k] for k in each])) for each in drawn]
+    low, high = np.quantile(found, (0.025, 0.975)).tolist()
     return low, high
 
 

@@ -1,6 +1,7 @@
 """`flexneedle import`: what it prints and writes."""
 
 import numpy as np
+import pytest
 import tomli_w
 from matplotlib.image import imread
 
@@ -18,7 +19,7 @@ def test_import_prints_what_it_understood_and_writes_a_session(tmp_path, capsys)
     status, shown, notes = run_import(capsys, *files, "--map", str(tmp_path / "lab.toml"), "--out", str(out))
     assert status == 0
     assert shown.splitlines() == [
-        "3 insertions in 3 sessions, 18 to 18 steps each, 0 % of the rows without a position",
+        "3 insertions in 3 sessions, 18 steps each, 0 % of the rows without a position",
         "depth 0 to 85 mm",
         "lateral offset -1.78 to 2.56 mm",
         "slope of the needle at the tip -52.5 to 59.5 mrad",
@@ -50,14 +51,28 @@ def test_a_file_is_no_folder_of_a_session(tmp_path, capsys):
     assert notes == f"flexneedle: {file}: cannot be created: File exists: choose another folder\n"
 
 
-def test_the_picture_has_a_panel_for_each_axis_and_a_colour_for_each_session(tmp_path):
-    files = [write_csv(tmp_path / f"gel{k}" / "a.csv", columns(guided(seed=k))) for k in range(9)]
+def test_numbers_of_steps_that_differ_are_a_range_and_one_session_is_singular(tmp_path):
+    files = [write_csv(tmp_path / f"{steps}.csv", columns(guided(steps))) for steps in (9, 12)]
+    line = "2 insertions in 1 session, 9 to 12 steps each, 0 % of the rows without a position"
+    assert load(*files).understood[0] == line
+
+
+def test_the_picture_has_a_panel_for_each_axis_and_a_colour_for_each_insertion(tmp_path):
+    files = [write_csv(tmp_path / f"gel{k // 5}" / f"{k}.csv", columns(guided(seed=k))) for k in range(10)]
     for plane in (False, True):
         figure = draw_session(load(*files, frame={"plane": plane}).session)
         titles = [ax.get_title(loc="left") for ax in figure.axes]
         sides = ["y"] if plane else ["y", "z"]
         assert titles == [f"{what} along {side}" for what in ("Tip", "Guide") for side in sides]
         named = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert named == [f"gel{k} (1)" for k in range(9)]
-        styles = {(line.get_color(), line.get_linestyle()) for line in figure.axes[0].get_lines()[2:]}
-        assert len(styles) == 9
+        assert named == [f"gel{k // 5}/{k}" for k in (0, 1, 2, 3, 5, 6, 7, 9)]
+        assert len({line.get_color() for line in figure.axes[0].get_lines()[2:]}) == 10
+
+
+@pytest.mark.parametrize(
+    ("order", "style"), [("before", "steps-pre"), ("with", "default"), ("after", "steps-post")]
+)
+def test_the_guide_is_drawn_as_it_moves(tmp_path, order, style):
+    file = write_csv(tmp_path / "a.csv", columns(guided()))
+    tip, guide = draw_session(load(file, steps={"guide": order}, frame={"plane": True}).session).axes
+    assert [ax.get_lines()[-1].get_drawstyle() for ax in (tip, guide)] == ["default", style]

@@ -25,7 +25,12 @@ def test_a_good_map_raises_no_suspicion(files):
     [
         ({"tip": TIP | {"unit": "um"}}, "the insertions are 0.085 mm deep (median): check tip.unit = 'um' (mm?)"),
         ({"tip": TIP | {"unit": "m"}, "steps": {"gap_mm": 1e5}}, "check tip.unit = 'm' (mm?)"),
-        ({"guide": GUIDE | {"unit": "um"}}, "the guide moves by 0.0042 mm at most: check guide.unit"),
+        (
+            {"guide": GUIDE | {"unit": "um"}},
+            "the guide moves by 0.0042 mm at most, so that stiffness and guide distance will not be identified: "
+            "check guide.unit",
+        ),
+        ({"frame": {"skin_mm": 100.0}}, "5 of 5 insertions have no step in tissue: check tip.unit, frame.x and"),
         ({"guide": GUIDE | {"unit": "m"}}, "check guide.unit"),
         ({"guide": GUIDE | {"y": "-gy"}}, "turns towards the guide's motion along y"),
         ({"guide": GUIDE | {"z": "-gz"}}, "turns towards the guide's motion along z"),

@@ -1,28 +1,32 @@
 """The picture of a session: paths of the tip and positions of the guide over depth, on each lateral axis."""
 
-from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.figures.layout import legend_of, look, short
+from flexneedle.figures.layout import legend_of, short
 from flexneedle.figures.style import QUIET, apply_style, new_figure, settle
 from flexneedle.files import replace_file
-from flexneedle.lab.calibration.session import Recording, Session
+from flexneedle.lab.calibration.importing.summary import count_insertions
+from flexneedle.lab.calibration.session import Session
 
 PICTURE_FILE = "session.png"
+GUIDE_STYLES = {"before": "steps-pre", "with": "default", "after": "steps-post"}
+"""Style of the guide's line over depth by `Session.guide_order`."""
 _HEIGHTS = (2.6, 1.5)  # inches: tip, guide
 _MARGINS = 1.2
 _MOST_STEPS = 200  # that are drawn of a path
 _LABEL = 40  # characters
-_COLORS, _STYLES = 7, ("-", "--", ":")  # colours after which the style of the line changes
+_NAMED = 8  # insertions that the legend names: all, or as many evenly from the first to the last
+_LIGHTEST = 0.9  # of the map of colours
 
 
 def draw_session(session: Session) -> Figure:
-    """Return the figure: rows for tip and guide, columns for the lateral axes, a colour for each session."""
+    """Return the figure: rows for tip and guide, columns for the lateral axes, a colour for each insertion."""
     with apply_style():
         figure = new_figure(sum(_HEIGHTS) + _MARGINS)
         panels = figure.subplots(
@@ -37,9 +41,9 @@ def draw_session(session: Session) -> Figure:
             guide.set_xlabel("depth of the tip (mm)")
         for row in panels:
             row[0].set_ylabel("lateral offset (mm)")
-        counts = (len(session.recordings), "insertion"), (len(session.names), "session")
-        shown = " in ".join(f"{count} {noun}{'s' * (count > 1)}" for count, noun in counts)
-        figure.suptitle(f"Recorded: {shown}", x=0.01, ha="left", fontsize=11, weight="bold")
+        figure.suptitle(
+            f"Recorded: {count_insertions(session)}", x=0.01, ha="left", fontsize=11, weight="bold"
+        )
         legend_of(figure, [panels[0, 0]])
         for handle in filter(None, figure.legends[0].legend_handles):
             handle.set_alpha(1.0)
@@ -49,29 +53,20 @@ def draw_session(session: Session) -> Figure:
 def _draw(ax: Axes, session: Session, quantity: str, axis: int) -> None:
     ax.axvline(0.0, color="#8c5a36", linewidth=1.0, zorder=1)
     ax.axhline(0.0, color=QUIET, linewidth=0.6, zorder=1)
-    alpha = float(np.clip(8.0 / len(session.recordings), 0.35, 0.9))
-    for number, name in enumerate(session.names):
-        shown = [one for one in session.recordings if one.session == name]
-        depth, across = _lines(shown, quantity, axis)
-        label = f"{short(name, _LABEL)} ({len(shown)})"
-        style = _STYLES[number // _COLORS % len(_STYLES)]
-        ax.plot(
-            depth, across, style, color=look(number).color, linewidth=1.0, alpha=alpha, label=label, zorder=3
-        )
+    alpha = float(np.clip(20.0 / len(session.recordings), 0.35, 0.9))
+    last = len(session.recordings) - 1
+    named = np.linspace(0, last, min(_NAMED, last + 1)).astype(int)
+    steps = GUIDE_STYLES[session.guide_order] if quantity == "guide" else "default"
+    for number, one in enumerate(session.recordings):
+        kept = np.unique(np.linspace(0, len(one.depth) - 1, _MOST_STEPS).astype(int))
+        (line,) = ax.plot(one.depth[kept], getattr(one, quantity)[kept, axis], drawstyle=steps, zorder=3)
+        line.set(linewidth=1.0, alpha=alpha, color=colormaps["viridis"](_LIGHTEST * number / max(1, last)))
+        if number in named:
+            line.set_label(short(f"{one.session}/{one.name}", _LABEL))
     ax.margins(x=0.01)
     low, high = ax.get_ylim()
     if high - low < 1.0:
         ax.set_ylim(0.5 * (low + high) - 0.5, 0.5 * (low + high) + 0.5)
-
-
-def _lines(recordings: Sequence[Recording], quantity: str, axis: int) -> tuple[list[float], list[float]]:
-    """Return one line through all paths, with gaps between them, of at most `_MOST_STEPS` steps each."""
-    depth, across = list[float](), list[float]()
-    for one in recordings:
-        kept = np.unique(np.linspace(0, len(one.depth) - 1, _MOST_STEPS).astype(int))
-        depth += [*one.depth[kept].tolist(), np.nan]
-        across += [*getattr(one, quantity)[kept, axis].tolist(), np.nan]
-    return depth, across
 
 
 def save_picture(figure: Figure, folder: Path) -> None:

@@ -14,10 +14,9 @@ def summarize(session: Session, found: Found) -> Iterator[str]:
     """Yield the lines; found: of the tables, with the missing positions and the fitted frames."""
     recordings = session.recordings
     steps = [len(one.depth) for one in recordings]
-    yield (
-        f"{len(recordings)} insertions in {len(session.names)} sessions, {min(steps)} to {max(steps)} steps each, "
-        f"{100.0 * found.missing:.3g} % of the rows without a position"
-    )
+    spread = f"{min(steps)} to {max(steps)}" if min(steps) < max(steps) else f"{max(steps)}"
+    missing = f"{100.0 * found.missing:.3g} % of the rows without a position"
+    yield f"{count_insertions(session)}, {spread} steps each, {missing}"
     depth = np.concatenate([one.depth for one in recordings])
     across = np.concatenate([one.position for one in recordings])
     above = int((depth < 0.0).sum())
@@ -37,6 +36,12 @@ def summarize(session: Session, found: Found) -> Iterator[str]:
         rows = zip("xyz", frame.rotation.round(3).tolist(), strict=True)
         shown = ", ".join(f"{axis} = {row}" for axis, row in rows)
         yield f"fitted frame of {name} in the axes of the tracker: {shown}"
+
+
+def count_insertions(session: Session) -> str:
+    """Return the numbers of insertions and sessions as text."""
+    counts = (len(session.recordings), "insertion"), (len(session.names), "session")
+    return " in ".join(f"{count} {noun}{'s' * (count > 1)}" for count, noun in counts)
 
 
 def _describe_slope(recordings: Sequence[Recording]) -> str:

@@ -41,6 +41,12 @@ def _wrong_depths(recordings: Sequence[Recording], recording_map: RecordingMap |
             other = [unit for unit, size in LENGTHS.items() if 20.0 <= reached * size / LENGTHS[now] <= 250.0]
             line += f": check tip.unit = {now!r}" + (f" ({' or '.join(other)}?)" if other else "")
         yield line
+    above = sum(float(one.depth.max()) <= 0.0 for one in recordings)
+    if above:
+        yield (
+            f"{above} of {len(recordings)} insertions have no step in tissue: check tip.unit, frame.x and "
+            "frame.skin_mm"
+        )
     speeds = [
         np.ptp(one.depth) / np.ptp(one.time)
         for one in recordings
@@ -53,7 +59,9 @@ def _wrong_depths(recordings: Sequence[Recording], recording_map: RecordingMap |
 def _wrong_sizes(recordings: Sequence[Recording], recording_map: RecordingMap | None) -> Iterator[str]:
     moved = max(one.guide_moves for one in recordings)
     if recording_map is not None and recording_map.guide is not None and moved < _STILL_MM:
-        yield f"the guide moves by {moved:.2g} mm at most: check guide.unit and the columns of [guide]"
+        still = all(one.rests for one in recordings)
+        lost = ", so that stiffness and guide distance will not be identified" if still else ""
+        yield f"the guide moves by {moved:.2g} mm at most{lost}: check guide.unit and the columns of [guide]"
     if moved > _FAR_MM:
         yield f"the guide moves by {moved:.3g} mm: check guide.unit"
     roll = max(float(np.ptp(one.roll)) for one in recordings)

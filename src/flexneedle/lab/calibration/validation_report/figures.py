@@ -12,6 +12,7 @@ from flexneedle.figures.layout import Look, fit, legend_of, look, mosaic, short
 from flexneedle.figures.style import ESTIMATE, INK, NEEDLE, QUIET, TRUE, apply_style, is_column, new_figure
 from flexneedle.lab.calibration.baselines import REGRESSION
 from flexneedle.lab.calibration.comparison import MODEL, WIDTH, Errors, Tested
+from flexneedle.lab.calibration.importing.picture import GUIDE_STYLES
 from flexneedle.lab.calibration.validation_report.response import responses
 from flexneedle.lab.calibration.verdicts import NAMES, depth_limits, groups_of, row_of
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 _FAINT = "#c9cbd0"
 _RIGHT = 90.0, 98.0  # %, of a coverage
 _BINS = 6
+_LEAST_RESPONSES = 3
 _SHARES = 0.1, 0.5  # depths from which paths are predicted, of the deepest
 _RANKS = {0.25: "small error", 0.5: "median error", 0.9: "large error"}
 _DECADES = 200.0  # range of errors up to which the axis has marks between decades
@@ -168,7 +170,7 @@ def draw_paths(found: "Validation") -> Figure:
         panels[-1, 0].set_ylabel("guide (mm)")
         size = 8 if is_column() else 11
         figure.suptitle("Predicted and measured paths", x=0.01, ha="left", fontsize=size, weight="bold")
-        legend_of(figure, [panels[0, 0], panels[-1, 0]])
+        legend_of(figure, [*panels[0], panels[-1, 0]])
     return figure
 
 
@@ -194,9 +196,7 @@ def _draw_path(ax: Axes, tested: Tested, axis: int, limits: tuple[float, float])
         middle, half = forecast.position[i, shown, axis], WIDTH * forecast.sd[i, shown, axis]
         color, depth = look(k).color, one.depth[shown]
         ax.fill_between(depth, middle - half, middle + half, color=color, alpha=0.2, linewidth=0.0, zorder=1)
-        ax.plot(
-            depth, middle, color=color, label=f"predicted from {share * deepest:.0f} mm, with 95 %", zorder=3
-        )
+        ax.plot(depth, middle, color=color, label=f"predicted from {depth[0]:.0f} mm, with 95 %", zorder=3)
         ax.plot([depth[0]], [middle[0]], "o", color=color, markersize=6, markerfacecolor="white", zorder=5)
     ax.axhline(0.0, color=_FAINT, linewidth=0.6, zorder=0)
 
@@ -206,14 +206,15 @@ def _draw_guide(ax: Axes, tested: Tested) -> None:
     for axis in range(one.axes):
         name = f"guide along {'yz'[axis]}"
         style, color = "--" if axis else "-", NEEDLE if axis else INK
-        ax.step(one.depth, one.guide[:, axis], where="pre", linestyle=style, color=color, label=name)
+        steps = GUIDE_STYLES[tested.guide_order]
+        ax.plot(one.depth, one.guide[:, axis], drawstyle=steps, linestyle=style, color=color, label=name)
     ax.axhline(0.0, color=_FAINT, linewidth=0.6, zorder=0)
 
 
 def draw_response(found: "Validation") -> Figure | None:
-    """Return the figure of the slope's response to motions of the guide over depth; None without enough motions."""
+    """Return the figure of the slope's response to motions of the guide over depth; None with fewer than three bins."""
     shown = list(responses(found.tested, found.deepest))
-    if not shown:
+    if len(shown) < _LEAST_RESPONSES:
         return None
     depth = np.array([each.depth for each in shown])
     recorded = np.array([[each.recorded, each.low, each.high] for each in shown]) * 1e3
@@ -227,7 +228,7 @@ def draw_response(found: "Validation") -> Figure | None:
         )
         ax.plot(depth, recorded[:, 0], "o", color=INK, markersize=4, label="recorded", zorder=3)
         model = [1e3 * each.model for each in shown]
-        ax.plot(depth, model, color=ESTIMATE, label="model, same motions", zorder=2)
+        ax.plot(depth, model, "s-", color=ESTIMATE, markersize=4, label="model, same motions", zorder=2)
         ax.set_xlim(0.0, found.deepest)
         ax.set_xlabel("depth (mm)")
         ax.set_ylabel("response (mrad/mm)")

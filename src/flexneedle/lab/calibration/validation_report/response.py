@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.lab.calibration.comparison import Tested
+from flexneedle.lab.calibration.verdicts import bootstrap
 from flexneedle.types import Floats
 
-_BINS, _LEAST_MOVES = 8, 8
+_BINS, _LEAST_MOVES = 8, 8  # bins by depth at most; motions in each at least
 _LEAST_MM = 0.3  # motion of the guide that counts
-_DRAWS = 200  # of insertions in a bootstrap
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +26,19 @@ class Response:
 
 
 def responses(tested: Sequence[Tested], deepest: float) -> Iterator[Response]:
-    """Yield the responses by depth, where the recordings have enough motions of the guide.
+    """Yield the responses by depth, in bins that hold enough motions of the guide.
 
     The change of the slope in a step is regressed on the motion of the guide, with a constant for the bevel.
     """
     rows = np.concatenate([_changes(n, one) for n, one in enumerate(tested)])
     rows = rows[np.isfinite(rows).all(axis=1)]
-    edges = np.linspace(0.0, deepest, _BINS + 1)
-    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        part = rows[(rows[:, 1] >= low) & (rows[:, 1] < high)]
-        moves = int(np.count_nonzero(np.abs(part[:, 2]) > _LEAST_MM))
-        if moves >= _LEAST_MOVES:
-            ends = _interval(part)
-            yield Response(0.5 * (low + high), moves, _slope(part, 3), *ends, _slope(part, 4))
+    depth, low = np.sort(rows[np.abs(rows[:, 2]) > _LEAST_MM, 1]), 0.0
+    while len(ahead := depth[depth >= low]) >= _LEAST_MOVES:
+        high = max(low + deepest / _BINS, float(np.nextafter(ahead[_LEAST_MOVES - 1], np.inf)))
+        part, moves = rows[(rows[:, 1] >= low) & (rows[:, 1] < high)], int(np.count_nonzero(ahead < high))
+        ends = _interval(part)
+        yield Response(0.5 * (low + high), moves, _slope(part, 3), *ends, _slope(part, 4))
+        low = high
 
 
 def _changes(number: int, tested: Tested) -> Floats:
@@ -56,11 +56,4 @@ def _slope(rows: Floats, column: int) -> float:
 
 
 def _interval(rows: Floats) -> tuple[float, float]:
-    """Return the interval of the recorded response, by bootstrap over insertions."""
-    groups = [np.flatnonzero(rows[:, 0] == one) for one in np.unique(rows[:, 0])]
-    random, found = np.random.default_rng(0), []
-    for _ in range(_DRAWS):
-        drawn = np.concatenate([groups[k] for k in random.integers(len(groups), size=len(groups))])
-        found.append(_slope(rows[drawn], 3))
-    low, high = np.quantile(found, (0.025, 0.975)).tolist()
-    return low, high
+    return bootstrap(rows[:, 0], lambda drawn: _slope(rows[drawn], 3))
