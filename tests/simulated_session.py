@@ -36,10 +36,10 @@ def simulate(
             blanks.append(blank(name, f"{name}{n}", guide, depth))
     session = Session(tuple(blanks))
     scenario = load_scenario("gel").with_values({"setup.axes": axes, **changes})
-    return Session(tuple(_measured(session, scenario, angle, noise, random)))
+    return Session(tuple(measured(session, scenario, angle, noise, random)))
 
 
-def _measured(session, scenario, angle, noise, random):
+def measured(session, scenario, angle, noise, random):
     prepared = fitting_scenario(scenario, session)
     bevel = scenario.needle.bevel.offset_mm * np.array([np.cos(angle), np.sin(angle)])[: session.axes]
     trial = trial_of(prepared, parameters_of(prepared, ("bevel",), 0.0), bevel)

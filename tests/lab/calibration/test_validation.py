@@ -403,7 +403,7 @@ def test_json_has_all_rows(session, tmp_path, capsys, monkeypatch):
 def test_wrong_arguments_of_the_command_are_one_line(session, tmp_path, capsys):
     session.save(tmp_path)
     status, shown, notes = run(capsys, tmp_path, "gel", "--session", "c")
-    assert (status, shown, notes) == (2, "", "flexneedle: --session c: must be one of a\n")
+    assert (status, shown, notes) == (2, "", "flexneedle: session = c: must be one of a\n")
     status, _, notes = run(capsys, tmp_path / "none", "gel")
     assert (status, notes.count("\n")) == (2, 1)
     (tmp_path / "bad.toml").write_text(tomli_w.dumps({"name": "x"}))

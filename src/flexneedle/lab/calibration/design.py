@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 
@@ -37,29 +37,27 @@ class Proposal:
 
     Attributes:
         depth: Its depth (mm).
-        moves: Depths (mm) at which the guide moves, with its position y, z (mm) from there on.
+        moves: Depths (mm) at which the guide moves, each with its position y and, in space, z (mm) from there on.
         widths: Half-widths of intervals of 95 % after this and all earlier proposals, in the coordinates of the fit.
     """
 
     depth: float
-    moves: tuple[tuple[float, float, float], ...]
+    moves: tuple[tuple[float, ...], ...]
     widths: tuple[tuple[Parameter, float], ...]
 
 
-def propose(
-    scenario: Scenario, names: Sequence[str], count: int, noise: Noise | None = None
-) -> list[Proposal]:
+def propose(scenario: Scenario, names: Sequence[str], count: int) -> list[Proposal]:
     """Return `count` insertions, the one first that shrinks the intervals of parameters most, then the next.
 
-    They end at the depth of the target. noise: from a fit (default: the tracker's, with the errors of the model in
-    recorded gels). Raises InputError for unknown parameters.
+    They end at the depth of the target. The noise is the tracker's, with the errors of the model in recorded gels.
+    Raises InputError for unknown parameters.
     """
     depth = scenario.target.depth_mm
     session = Session(tuple(_candidates(scenario, depth)))
     prepared = fitting_scenario(scenario, session)
     parameters = parameters_of(prepared, names, depth)
     problem = Problem(prepared, parameters, Replay.of(session))
-    gains = _informations(problem, noise or _usual_noise(scenario))
+    gains = _informations(problem, _usual_noise(scenario))
     information, proposals = np.diag(problem.sd**-2.0), list[Proposal]()
     for _ in range(count):
         best = min(range(len(gains)), key=lambda n: _size(information + gains[n], parameters))
@@ -72,21 +70,21 @@ def propose(
 
 
 def _candidates(scenario: Scenario, depth: float) -> Iterator[Recording]:
-    """Yield insertions with the guide at rest, and with motions of several sizes and directions at several depths."""
+    """Yield an insertion with the guide at rest, and others with motions to and fro by size, direction and depths."""
     axes, steps = scenario.setup.axes, np.linspace(0.0, depth, _STEPS + 1)
     largest = min(_LARGEST_MM, scenario.setup.max_guide_travel_mm) if scenario.setup.has_guide else 0.0
     directions = np.array([[1.0], [-1.0]]) if axes == 1 else np.array([[1.0, 0.0], [0.0, 1.0], [-0.7, 0.7]])
     places = [round(share * _STEPS) for share in _SHARES]
-    patterns = [(0.0,) * len(places)]
+    zero = np.zeros((len(steps), axes))
+    slope = zero if scenario.tracker.direction_jitter else np.full_like(zero, np.nan)
+    guides = [zero]
     if largest > 0.0:
-        patterns += [pattern for pattern in product((0.0, 1.0), repeat=len(places)) if any(pattern)]
-    for size, direction, pattern in product(_SIZES, directions, patterns):
-        guide = np.zeros((len(steps), axes))
-        for k, (place, moved) in enumerate(zip(places, pattern, strict=True)):
-            side = 1.0 if k % 2 == 0 else -1.0  # to and fro
-            guide[place:] = guide[place:] if moved == 0.0 else side * size * largest * direction
-        zero = np.zeros_like(guide)
-        slope = zero if scenario.tracker.direction_jitter else np.full_like(guide, np.nan)
+        patterns = [pattern for pattern in product((False, True), repeat=len(places)) if any(pattern)]
+        for size, direction, pattern in product(_SIZES, directions, patterns):
+            guides.append(zero.copy())
+            for k, place in enumerate(compress(places, pattern)):
+                guides[-1][place:] = (-1.0) ** k * size * largest * direction
+    for guide in guides:
         yield Recording("design", "", 0.0 * steps, steps, zero, slope, guide, zero, 0.0 * steps)
 
 
@@ -113,11 +111,10 @@ def _size(information: Floats, parameters: Sequence[Parameter]) -> float:
     return float(np.log(_deviations(information, parameters)).sum())
 
 
-def _moves(one: Recording) -> Iterator[tuple[float, float, float]]:
-    """Yield depth and position y, z of the guide where it moves."""
+def _moves(one: Recording) -> Iterator[tuple[float, ...]]:
+    """Yield depth and position of the guide where it moves."""
     for k in np.flatnonzero(one.moved).tolist():
-        y, z = (*one.guide[k].tolist(), 0.0)[:2]
-        yield float(one.depth[k]), y, z
+        yield float(one.depth[k]), *one.guide[k].tolist()
 
 
 def _usual_noise(scenario: Scenario) -> Noise:

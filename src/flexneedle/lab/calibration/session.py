@@ -8,7 +8,7 @@ from hashlib import sha256
 from io import BytesIO
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import tomli_w
@@ -184,24 +184,27 @@ class Session:
 
 
 def load_session(folder: str | Path) -> Session:
-    """Return the session of a folder of `flexneedle import`. Raises InputError if it has none."""
+    """Return the session of a folder of `flexneedle import`. Raises InputError if it has none, or a damaged one."""
     require_extra("study", "pyarrow")
-    from pyarrow import ArrowInvalid
     from pyarrow.parquet import read_table
 
     folder = Path(folder)
     try:
-        head = tomllib.loads((folder / SESSION_FILE).read_text())
+        head = tomllib.loads((folder / SESSION_FILE).read_text(encoding="utf-8"))
         columns = {name: column.to_numpy() for name, column in read_columns(read_table(folder / STEPS_FILE))}
-    except (OSError, tomllib.TOMLDecodeError, ArrowInvalid) as error:
+    except (OSError, ValueError) as error:  # of TOML, UTF-8 and Arrow
         raise InputError(f"{folder}: not a session: {error}") from None
-    if head.get("format") != _FORMAT:
-        raise InputError(f"{folder}: format must be {_FORMAT}, not {head.get('format')}")
+    for key, choices in {"format": (_FORMAT,), "axes": (1, 2), "guide_order": get_args(GuideOrder)}.items():
+        if head.get(key) not in choices:
+            rule = f"must be {' or '.join(map(str, choices))}"
+            raise InputError(f"{folder}: {SESSION_FILE}: {key} = {head.get(key)}: {rule}")
     try:
-        recordings = tuple(from_columns(columns, int(head["axes"])))
-        return Session(recordings, head["guide_order"], head.get("origin", {}))
+        recordings = tuple(from_columns(columns, head["axes"]))
     except KeyError as error:
-        raise InputError(f"{folder}: has no column or key {error}") from None
+        raise InputError(f"{folder}: {STEPS_FILE}: has no column {error}") from None
+    except InputError as error:
+        raise InputError(f"{folder}: {STEPS_FILE}: {error}") from None
+    return Session(recordings, head["guide_order"], head.get("origin", {}))
 
 
 def read_columns(rows: Any) -> Iterator[tuple[str, Any]]:
@@ -228,21 +231,33 @@ def to_columns(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def from_columns(columns: Mapping[str, Any], axes: int) -> Iterator[Recording]:
-    """Yield the recordings of columns as of `to_columns`. Raises KeyError for a missing column."""
+    """Yield the recordings of columns as of `to_columns`.
+
+    Raises KeyError for a missing column, InputError for values that are no numbers or not finite.
+    """
     keys = list(zip(columns["session"], columns["insertion"], strict=True))
+    if not keys:
+        raise InputError("has no rows")
+    single = {"time": "time_s", "depth": "x_mm", "roll": "roll_rad"}
+    numbers = {key: _numbers(columns, column) for key, column in single.items()}
+    for kind in _NUMBERS:
+        numbers[kind] = np.stack([_numbers(columns, column) for column in _columns(kind, axes)], axis=1)
     for (session, name), group in groupby(range(len(keys)), key=keys.__getitem__):
         rows = np.array([*group])
-        across = {
-            kind: np.stack([columns[column][rows] for column in _columns(kind, axes)], axis=1)
-            for kind in _NUMBERS
-        }
-        single = {"time": "time_s", "depth": "x_mm", "roll": "roll_rad"}
-        yield Recording(
-            str(session),
-            str(name),
-            **{key: columns[column][rows] for key, column in single.items()},
-            **across,
-        )
+        yield Recording(str(session), str(name), **{key: values[rows] for key, values in numbers.items()})
+
+
+def _numbers(columns: Mapping[str, Any], name: str) -> Floats:
+    """Return a column of finite numbers, or NaN in times and slopes."""
+    values = columns[name]
+    if values.dtype.kind not in "fiu":
+        raise InputError(f"column {name}: must have numbers, not {values.dtype}")
+    wrong = np.isinf(values) if name.startswith(("time", "slope")) else ~np.isfinite(values)
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise InputError(f"column {name}, row {row + 1} of {len(wrong)}: {values[row]}: must be finite")
+    found: Floats = values.astype(float)
+    return found
 
 
 def _columns(name: str, axes: int) -> list[str]:

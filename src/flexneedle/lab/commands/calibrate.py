@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Any
 
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
@@ -11,6 +14,10 @@ from flexneedle.cli.common import print_json, print_table
 from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import make_number_type
 from flexneedle.errors import InputError
+
+if TYPE_CHECKING:
+    from flexneedle.lab.calibration.design import Proposal
+    from flexneedle.lab.calibration.session import Session
 
 
 def add_parser(commands: Commands) -> None:
@@ -72,37 +79,87 @@ def _calibrate(args: argparse.Namespace) -> int:
     from flexneedle.lab.calibration.session import load_session
 
     session = load_session(args.session)
-    found = calibrate(args.scenario, session if args.name is None else session.of(args.name), args.fit)
+    chosen = session if args.name is None else session.of(args.name)
+    if args.profile is not None:
+        _check_profile(args, chosen)
+    _check_out(args.out)
+    found = calibrate(args.scenario, chosen, args.fit)
     write_calibration(found, args.out, str(args.scenario))
-    if args.json:
-        print_json(read_record(args.out) or {})
-    else:
+    if not args.json:
         print_table("", ("parameter", "value", "95 %"), found.table())
         position, slope = found.final.noise.sd[-2:].tolist()
         print(f"Errors of readings: {position:.2g} mm, {1e3 * slope:.2g} mrad")
         print(f"\nScenario: {args.out}")
+    profile = None
     if args.profile is not None:
         from flexneedle.lab.calibration.picture import save_profile
 
-        print(f"Profile: {save_profile(found, args.profile, args.out)}")
+        profile = str(save_profile(found, args.profile, args.out))
+    if args.json:
+        print_json({**(read_record(args.out) or {}), "profile": profile})
+    elif profile is not None:
+        print(f"Profile: {profile}")
     for line in (*found.notes, *found.problems):
         print_note(line)
     return 1 if found.problems else 0
+
+
+def _check_profile(args: argparse.Namespace, session: Session) -> None:
+    """Raise InputError for a profile of what is not fitted, or of several parameters."""
+    from flexneedle.lab.calibration.parameters import parameters_of
+    from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
+    from flexneedle.scenario.files import load_scenario
+
+    used = shallow(session)
+    scenario = fitting_scenario(load_scenario(args.scenario), used)
+    fitted = parameters_of(scenario, args.fit, Replay.of(used).reached)
+    if sum(args.profile in (each.name, each.label) for each in fitted) != 1:
+        choices = ", ".join(each.label for each in fitted)
+        raise InputError(f"--profile {args.profile}: must be one of {choices}")
+
+
+def _check_out(path: Path) -> None:
+    """Create the folder of the scenario. Raises InputError if no file can be written there."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder: --out must be a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}: choose another --out") from None
 
 
 def _design(args: argparse.Namespace) -> int:
     from flexneedle.lab.calibration.design import propose
     from flexneedle.scenario.files import load_scenario
 
+    if args.session is not None:
+        raise InputError(f"{args.session}: --design needs no session: give only the scenario")
     proposals = propose(load_scenario(args.scenario), args.fit, args.design)
-    rows = [
-        (
-            str(k),
-            f"{each.depth:.0f} mm",
-            "; ".join(f"at {x:.0f} mm to ({y:+.1f}, {z:+.1f}) mm" for x, y, z in each.moves) or "at rest",
-            ", ".join(parameter.format_width(width) for parameter, width in each.widths),
-        )
-        for k, each in enumerate(proposals, 1)
-    ]
-    print_table("", ("insertion", "depth", "guide (y, z)", "intervals of 95 % after it"), rows)
+    if args.json:
+        print_json({"insertions": [_to_values(each) for each in proposals]})
+        return 0
+    print(f"Insertions to {proposals[0].depth:.0f} mm, each with the intervals of 95 % after it")
+    for number, each in enumerate(proposals, 1):
+        moves = [f"at {depth:.0f} mm guide to {_format_place(place)} mm" for depth, *place in each.moves]
+        widths = [parameter.format_width(width) for parameter, width in each.widths]
+        print(f"\nInsertion {number}", *(moves or ["guide at rest"]), *widths, sep="\n  ")
     return 0
+
+
+def _format_place(place: list[float]) -> str:
+    text = ", ".join(f"{value + 0.0:+.1f}" for value in place)
+    return text if len(place) == 1 else f"({text})"
+
+
+def _to_values(proposal: Proposal) -> dict[str, Any]:
+    """Return a proposal as plain values; the interval of a positive quantity by its factor to either side."""
+    return {
+        "depth_mm": proposal.depth,
+        "guide": [{"depth_mm": depth, "position_mm": place} for depth, *place in proposal.moves],
+        "intervals": {
+            each.label: {"factor": math.exp(width)} if each.log else {"half_width": width, "unit": each.unit}
+            for each, width in proposal.widths
+        },
+    }

@@ -12,7 +12,6 @@ from flexneedle.cli.common import add_width, print_json, print_table
 from flexneedle.cli.values import positive
 
 if TYPE_CHECKING:
-    from flexneedle.lab.calibration.session import Session
     from flexneedle.lab.calibration.validation import Validation
     from flexneedle.lab.calibration.verdicts import Row
 
@@ -59,8 +58,9 @@ def _validate(args: argparse.Namespace) -> int:
     from flexneedle.lab.calibration.session import load_session
     from flexneedle.lab.calibration.validation import validate
 
-    session = _choose(load_session(args.session), args.name)
-    found = validate(args.scenario, session, args.ahead)
+    session = load_session(args.session)
+    chosen = session if args.name is None else session.of(args.name)
+    found = validate(args.scenario, chosen, args.ahead)
     page = found.write(args.session / "validation" if args.out is None else args.out)
     if args.json:
         print_json({**found.values(), "page": str(page)})
@@ -68,15 +68,6 @@ def _validate(args: argparse.Namespace) -> int:
         _print(found)
         print(f"\nPage: {page}")
     return 0
-
-
-def _choose(session: Session, name: str | None) -> Session:
-    """Return one of the sessions, or all. Raises InputError for an unknown name."""
-    from flexneedle.errors import InputError
-
-    if name is not None and name not in session.names:
-        raise InputError(f"--session {name}: must be one of {', '.join(session.names)}")
-    return session if name is None else session.of(name)
 
 
 def _print(found: Validation) -> None:
