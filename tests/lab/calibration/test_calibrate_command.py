@@ -73,7 +73,7 @@ def test_an_unidentified_parameter_gets_no_number(tmp_path, capsys):
         ),
         (
             ("FOLDER", "gel", "--profile", "bevel"),
-            "--profile bevel: must be one of stiffness of gel, bevel along y",
+            "profile = bevel: must be one of stiffness of gel, bevel along y",
         ),
         (("FOLDER", "gel", "--design", "1"), "--design needs no session: give only the scenario"),
     ],

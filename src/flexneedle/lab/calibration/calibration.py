@@ -22,6 +22,7 @@ from flexneedle.lab.calibration.parameters import (
     Parameter,
     Trial,
     at_same_curvature,
+    find_parameter,
     parameters_of,
     trial_of,
     with_trial,
@@ -154,12 +155,7 @@ class Calibration:
 
     def profile(self, name: str, count: int = 9) -> Profile:
         """Return the profile of a parameter, by its name or its label. Raises InputError for another."""
-        chosen = [k for k, each in enumerate(self.parameters) if name in (each.name, each.label)]
-        if len(chosen) != 1:
-            raise InputError(
-                f"profile = {name}: must be one of {', '.join(each.label for each in self.parameters)}"
-            )
-        k = chosen[0]
+        k = find_parameter(self.parameters, name)
         parameter = self.parameters[k]
         interval = self.intervals[parameter.label]
         width = _PROFILED * (interval.high - interval.value)
@@ -197,13 +193,17 @@ def calibrate(
     if not session.recordings:
         raise InputError("session: has no recordings")
     loaded = load_scenario(scenario)
-    used = shallow(session)
-    prepared = fitting_scenario(loaded, used)
-    replay = Replay.of(used)
-    problem = Problem(prepared, parameters_of(prepared, fit, replay.reached), replay)
+    problem = make_problem(loaded, session, fit)
     with threadpool_limits(1, user_api="blas"):  # the matrices are small: more threads wait for each other
         best, others = _minimize(problem)
         return Calibration(loaded, session, best, others, *_identify(best), _tears(best))
+
+
+def make_problem(scenario: Scenario, session: Session, names: Sequence[str]) -> Problem:
+    """Return the fit of parameters by name. Raises as `calibrate`."""
+    used = shallow(session)
+    prepared, replay = fitting_scenario(scenario, used), Replay.of(used)
+    return Problem(prepared, parameters_of(prepared, names, replay.reached), replay)
 
 
 def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:

@@ -92,6 +92,15 @@ def parameters_of(scenario: Scenario, names: Sequence[str], reached: float) -> t
     return tuple(each for name in NAMES if name in names for each in _MAKERS[name](scenario, reached))
 
 
+def find_parameter(parameters: Sequence[Parameter], name: str) -> int:
+    """Return the place of a parameter by its name or its label. Raises InputError for another."""
+    chosen = [k for k, each in enumerate(parameters) if name in (each.name, each.label)]
+    if len(chosen) != 1:
+        labels = ", ".join(each.label for each in parameters)
+        raise InputError(f"profile = {name}: must be one of {labels}")
+    return chosen[0]
+
+
 def _stiffness(scenario: Scenario, reached: float) -> Iterator[Parameter]:
     for layer, top in zip(scenario.tissue, scenario.layer_tops, strict=True):
         if top < reached:

@@ -13,6 +13,7 @@ from flexneedle.lab.calibration.session import STILL, Recording, Session
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Flags, Floats
 
+_LEAST_STEPS = 3  # for a turn that is no outlier
 _AIR_MM = 1.0  # from the start of the model to the skin, and to the first step, at least
 _LONGEST_MM = 1.0  # advance in a step of the model
 STEEP = 0.5
@@ -115,6 +116,8 @@ def shallow(session: Session) -> Session:
 
 def _shallow_steps(one: Recording) -> int:
     """Return the number of steps, at least two, before the needle turns too far; single outliers do not count."""
+    if len(one.depth) < _LEAST_STEPS:
+        return len(one.depth)
     advance = np.maximum(np.abs(np.gradient(one.depth)), _LONGEST_MM)[:, None]
     course = np.gradient(one.position, axis=0) / advance
     turn = np.where(np.isfinite(one.slope), one.slope - one.slope[0], course)

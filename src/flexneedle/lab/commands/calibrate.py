@@ -17,7 +17,6 @@ from flexneedle.errors import InputError
 
 if TYPE_CHECKING:
     from flexneedle.lab.calibration.design import Proposal
-    from flexneedle.lab.calibration.session import Session
 
 
 def add_parser(commands: Commands) -> None:
@@ -74,14 +73,16 @@ def _calibrate(args: argparse.Namespace) -> int:
         return _design(args)
     if args.session is None:
         raise InputError("SESSION: missing: the folder of flexneedle import, before the scenario")
-    from flexneedle.lab.calibration.calibration import calibrate
+    from flexneedle.lab.calibration.calibration import calibrate, make_problem
     from flexneedle.lab.calibration.files import read_record, write_calibration
+    from flexneedle.lab.calibration.parameters import find_parameter
     from flexneedle.lab.calibration.session import load_session
+    from flexneedle.scenario.files import load_scenario
 
     session = load_session(args.session)
     chosen = session if args.name is None else session.of(args.name)
     if args.profile is not None:
-        _check_profile(args, chosen)
+        find_parameter(make_problem(load_scenario(args.scenario), chosen, args.fit).parameters, args.profile)
     _check_out(args.out)
     found = calibrate(args.scenario, chosen, args.fit)
     write_calibration(found, args.out, str(args.scenario))
@@ -102,20 +103,6 @@ def _calibrate(args: argparse.Namespace) -> int:
     for line in (*found.notes, *found.problems):
         print_note(line)
     return 1 if found.problems else 0
-
-
-def _check_profile(args: argparse.Namespace, session: Session) -> None:
-    """Raise InputError for a profile of what is not fitted, or of several parameters."""
-    from flexneedle.lab.calibration.parameters import parameters_of
-    from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
-    from flexneedle.scenario.files import load_scenario
-
-    used = shallow(session)
-    scenario = fitting_scenario(load_scenario(args.scenario), used)
-    fitted = parameters_of(scenario, args.fit, Replay.of(used).reached)
-    if sum(args.profile in (each.name, each.label) for each in fitted) != 1:
-        choices = ", ".join(each.label for each in fitted)
-        raise InputError(f"--profile {args.profile}: must be one of {choices}")
 
 
 def _check_out(path: Path) -> None:
