@@ -22,8 +22,8 @@ class Trajectories:
     On demand, of each step, or (N, 1, …) of the last alone, else of size 0: energy (N, m): strain energy of the tissue,
     mJ. deflection: mean square of the needle's lateral deflection, mm², as in the planner. stretch: least stretch of
     the tissue at the needle. strain: largest bending strain of the needle. loads (N, m, 6): force y, z (N) and moment
-    y, z (N·mm) of the clamp on the needle, force y, z of the guide. shapes (N, m, n, 5): poses at the needle's nodes,
-    mm and rad. ends (N,): states after the last step.
+    y, z (N·mm) of the clamp on the needle, force y, z of the guide. clearance: least distance (mm) of the inserted
+    needle from the zones to avoid. shapes (N, m, n, 5): poses at the needle's nodes, mm and rad. ends (N,): states after the last step.
     """
 
     controls: Floats
@@ -35,6 +35,7 @@ class Trajectories:
     stretch: Floats = field(default_factory=lambda: np.empty((0, 0)))
     strain: Floats = field(default_factory=lambda: np.empty((0, 0)))
     loads: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
+    clearance: Floats = field(default_factory=lambda: np.empty((0, 0)))
     ends: Sequence[Any] = ()
 
     @cached_property

@@ -16,6 +16,7 @@ from flexneedle.mechanics.lanes import fill, lanes_of, least, load, load_all, mo
 from flexneedle.mechanics.lateral import Lateral, axes_of, dot, size, square, times, y_of, z_of
 from flexneedle.mechanics.needle import LATERALS, REALS, Held, NeedleState, apart, together
 from flexneedle.mechanics.spring import spring_energy
+from flexneedle.mechanics.zones import Zones, least_distance
 
 from flexneedle.mechanics.work import (  # isort: skip
     CONSTANTS, CONTACT, GUIDE, HEIGHT, KIND, LOAD, MOMENT, REST, SHEAR, SLOPE, U, WEIGHT, X, Y,
@@ -61,6 +62,7 @@ class Outputs(NamedTuple):
     deflection: Floats  # mean square distance (N, m) of the needle from an axis, mm²
     loads: Floats  # `LOADS` (N, m, 6)
     strain: Floats  # largest curvature of the needle that bends it elastically (N, m), 1/mm
+    clearance: Floats  # least distance (N, m) of the needle's axis from the zones, mm
     curves: Floats  # x, y and slope at base, nodes and tip (N, m, n + 2, 1 + 2 axes); the last are at the tip
     ends: Starts  # states at the end
     solution: Floats  # at the end, at the nodes (N, n, 5, axes): columns `SOLUTION`
@@ -207,8 +209,9 @@ def _spill_loads(w: Needles, needle: NeedleState, out: Floats, j: int, k: int) -
 
 @inner
 def _spill_step(
-    w: Needles, space: Workspace, needle: NeedleState, count: int, out: Outputs, j: int, k: int, left: int
-) -> None:
+    w: Needles, space: Workspace, zones: Zones, needle: NeedleState, count: int, out: Outputs, j: int, k: int,
+    left: int,
+) -> None:  # fmt: skip
     """Write the outputs of step k, with `left` steps from it to the end; an output may have the last steps alone."""
     tip = needle.solution.tip
     spill(tip.x + 0.0, out.tips, j, k, 0)
@@ -230,6 +233,9 @@ def _spill_step(
     at = out.loads.shape[1] - left
     if at >= 0:
         _spill_loads(w, needle, out.loads, j, at)
+    at = out.clearance.shape[1] - left
+    if at >= 0:
+        spill(least_distance(w, zones, needle, count), out.clearance, j, at)
     at = out.curves.shape[1] - left
     if at >= 0:
         _spill_curves(w, needle, count, out.curves, j, at)
@@ -266,6 +272,7 @@ def rollout(
     commands: Floats,
     held: Floats,
     axes: Floats,
+    zones: Zones,
     first: int,
     last: int,
     out: Outputs,
@@ -279,7 +286,7 @@ def rollout(
     steps = commands.shape[1]
     ends, curves = out.solution.size > 0, out.curves.size > 0
     loads = ends or out.loads.size > 0 or out.strain.size > 0
-    shape = ends or curves or out.deflection.size > 0
+    shape = ends or curves or out.deflection.size > 0 or out.clearance.size > 0
     for j in range(first, last, lanes_of(space.constants)):
         constants, before = _gather_models(space, models, model_of, j)
         tissue, memory = (space.mesh, space.layers, models.laws), (space.reals, space.laterals)
@@ -291,7 +298,7 @@ def rollout(
             for column in range(9):
                 fill(space.command, 0, column, commands, sequence, j, k, column)
             needle, near = advance_needles(w, needle, space.command, near)
-            _spill_step(w, space, needle, _count(w, needle, near), out, j, k, steps - k)
+            _spill_step(w, space, zones, needle, _count(w, needle, near), out, j, k, steps - k)
         if steps == 0:
             fill(space.axis, 0, 0, held, sequence, j, 0, 0)
             fill(space.axis, 0, 1, held, sequence, j, 1, 0)

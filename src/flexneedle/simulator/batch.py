@@ -16,11 +16,12 @@ from flexneedle.mechanics.needle import row_size
 from flexneedle.mechanics.rollout import LOADS, POSE_SIZE, SOLUTION, Models, Outputs, Starts
 from flexneedle.mechanics.shape import equal_arc_nodes
 from flexneedle.mechanics.work import Workspace, workspace
+from flexneedle.mechanics.zones import Zones
 from flexneedle.types import Floats
 
 Whole = NDArray[np.int64]
 
-COLUMNS = ("energy", "stretch", "deflection", "loads", "strain", "shapes")
+COLUMNS = ("energy", "stretch", "deflection", "loads", "strain", "clearance", "shapes")
 """Names of the outputs of a rollout besides tips and convergence."""
 _STEPS_WORTH_A_THREAD = 1000
 _MOST_THREADS = 256
@@ -34,6 +35,7 @@ def run(
     state_of: Whole,
     commands: Floats,
     axes: Floats,
+    zones: Zones,
     threads: int,
     *,
     every_step: Collection[str] = (),
@@ -58,7 +60,7 @@ def run(
 
     def part(first: int, last: int) -> None:
         space = _workspace(n, models.layers.shape[1], across)
-        kernel.rollout(space, models, starts, *who, commands, tips, axes, first, last, out)
+        kernel.rollout(space, models, starts, *who, commands, tips, axes, zones, first, last, out)
 
     _share(part, size, min(threads, count * steps // _STEPS_WORTH_A_THREAD, size // WIDTH))
     return out
@@ -81,6 +83,7 @@ def _make_outputs(
         column("deflection"),
         column("loads", LOADS),
         column("strain"),
+        column("clearance"),
         column("shapes", nodes + 2, 1 + 2 * across),
         Starts(
             np.empty((last, row_size(across))),

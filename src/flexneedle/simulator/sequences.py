@@ -169,6 +169,10 @@ def trajectories(
     if found["strain"].size:
         radii = [[0.5 * state.scenario.needle.outer_diameter] for state in states]
         found["strain"] = np.array(radii) * found["strain"]
+    if found["clearance"].size:
+        found["clearance"] = found["clearance"] - [
+            [0.5 * state.scenario.needle.outer_diameter] for state in states
+        ]
     if models is not None:
         each = states if len(states) == count else [states[0]] * count
         found["ends"] = tuple(

@@ -16,6 +16,7 @@ from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Adaptation, Model, adapt, check_adaptation, insert_essential, pack
 from flexneedle.mechanics.rollout import Models
+from flexneedle.mechanics.zones import NO_ZONES, Zones
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.batch import count_cores, run
@@ -73,11 +74,13 @@ class Simulator:
         threads: int | None = None,
         *,
         constants: Model | None = None,
+        zones: Zones = NO_ZONES,
     ) -> None:
         self.scenario = load_scenario(scenario)
         self.threads = count_cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
         self._model = constants or self._nominal
         self._limits = Limits.of(self.scenario)
+        self.zones = zones
 
     def __repr__(self) -> str:
         return f"<Simulator of {self.scenario!r}, threads {self.threads}>"
@@ -149,7 +152,17 @@ class Simulator:
 
     def _carry_out(self, state: State, rows: Floats) -> tuple[State, Floats]:
         none, starts = np.zeros(1, dtype=np.int64), pack_states([state], self._model.nodes.size)
-        out = run(self._packed, none, starts, none, drive([state], rows[None]), self._no_lines, 1, ends=True)
+        out = run(
+            self._packed,
+            none,
+            starts,
+            none,
+            drive([state], rows[None]),
+            self._no_lines,
+            self.zones,
+            1,
+            ends=True,
+        )
         return end(state, self._model, rows, out, 0), out.tips[0]
 
     @property
@@ -208,7 +221,7 @@ class Simulator:
             models: The constants of each sequence, N of them (default: this simulator's, for all): from
                 `simulator.adapt(adaptation)`, or `simulator.model` of another scenario for states of that scenario.
             outputs: Names, or one name, of the outputs of each step: energy, stretch, deflection, loads, strain,
-                shapes. What is not asked for is not computed.
+                clearance, shapes. What is not asked for is not computed.
             at_end: Names of the outputs of the last step alone.
             ends: Whether the result has the states at the end.
             limits: Whether limits of commands apply; without them a step may be longer.
@@ -237,6 +250,7 @@ class Simulator:
             shared if len(begun) == 1 else each,
             drive(begun, rows),
             lines(begun, len(rows), axes),
+            self.zones,
             self.threads,
             every_step=wanted,
             at_end=last,
@@ -317,7 +331,7 @@ class Simulator:
         packed = self._packed if merged is self._model else pack([merged])
         none = np.zeros(1, dtype=np.int64)
         rows, starts = np.zeros((1, 0, len(COLUMNS))), pack_states([state], merged.nodes.size)
-        out = run(packed, none, starts, none, rows, self._no_lines, 1, ends=True, held=held)
+        out = run(packed, none, starts, none, rows, self._no_lines, self.zones, 1, ends=True, held=held)
         solved = Solved.of(merged, out, 0).without_points(merged.nodes)
         return replace(state, model=self._model, solved=solved)
 
@@ -336,4 +350,4 @@ class Simulator:
         return pack([self._model])
 
     def __reduce__(self) -> tuple[Callable[..., "Simulator"], tuple[Scenario, int]]:
-        return partial(Simulator, constants=self._model), (self.scenario, self.threads)
+        return partial(Simulator, constants=self._model, zones=self.zones), (self.scenario, self.threads)
