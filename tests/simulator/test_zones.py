@@ -121,7 +121,7 @@ def test_the_clearance_is_the_least_along_the_inserted_needle_at_each_step(name)
         made.capsule((15.0, 3.0, 1.0), (15.0, 3.0, 1.0), 1.5),
         made.capsule((8.0, -6.0, -3.0), (35.0, -4.0, 3.0), 1.0),
         made.box((25.0, 4.0, 0.0), (3.0, 1.0, 2.0), TURN),
-        made.half_space((40.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+        made.half_space((35.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
     ]
     found, radius, rows, simulator = rolled_out(name, zones, 5.0)
     chosen = np.s_[::3, 7::8]

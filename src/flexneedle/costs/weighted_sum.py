@@ -23,7 +23,8 @@ class Trajectories:
     mJ. deflection: mean square of the needle's lateral deflection, mm², as in the planner. stretch: least stretch of
     the tissue at the needle. strain: largest bending strain of the needle. loads (N, m, 6): force y, z (N) and moment
     y, z (N·mm) of the clamp on the needle, force y, z of the guide. clearance: least distance (mm) of the inserted
-    needle from the zones to avoid. shapes (N, m, n, 5): poses at the needle's nodes, mm and rad. ends (N,): states after the last step.
+    needle from the zones to avoid. shapes (N, m, n, 5): poses at the needle's nodes, mm and rad. ends (N,): states
+    after the last step.
     """
 
     controls: Floats

@@ -1,7 +1,7 @@
 """Distances of the needle from zones to avoid: primitives, and grids of distances (docs/theory.md section 14).
 
-Zones are fixed in the needle's frame. A distance is from a point of the needle's axis to the surface of a zone, negative
-inside. Of a zone that is farther than `far` along x no distance is computed.
+Zones are fixed in the needle's frame. A distance is from a point of the needle's axis to the surface of a zone,
+negative inside. Of a zone that is farther than `far` along x no distance is computed.
 """
 
 from collections.abc import Sequence
