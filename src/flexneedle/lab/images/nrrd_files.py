@@ -1,0 +1,161 @@
+"""Label maps in NRRD files, and segmentations of 3D Slicer (`.seg.nrrd`) with overlapping segments in layers."""
+
+import re
+from collections.abc import Mapping
+from io import BytesIO
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.arguments import make_refusal
+from flexneedle.errors import InputError
+from flexneedle.lab.images.frames import LPS, RAS, swap_affine
+from flexneedle.lab.images.label_map import LabelMap, Segment, name_labels
+from flexneedle.types import Floats
+
+_SPACES = {"left-posterior-superior": LPS, "lps": LPS, "right-anterior-superior": RAS, "ras": RAS}
+_SOURCES = ("Segmentation_SourceRepresentation", "Segmentation_MasterRepresentation")  # since and before 5.2
+_BINARY = "Binary labelmap"
+_OFFSET = "Segmentation_ReferenceImageExtentOffset"
+_FIELD = re.compile(r"Segment(\d+)_\w+")
+
+
+def read_nrrd(path: Path) -> LabelMap:
+    """Return the label map of an NRRD file. Raises InputError, and errors of pynrrd for a damaged file."""
+    import nrrd
+
+    values, header = nrrd.read(str(path))
+    if values.ndim not in (3, 4):
+        raise make_refusal("dimension", values.ndim, "must be 3, or 4 with a list axis first")
+    affine = _read_affine(header, values.ndim)
+    labels = values if values.ndim == 4 else values[None]
+    numbers = {int(found[1]) for key in header if (found := _FIELD.fullmatch(key))}
+    is_segmentation = bool(numbers) or path.name.lower().endswith(".seg.nrrd")
+    if is_segmentation and labels[0].size == 1:
+        labels = np.zeros_like(labels)  # 3D Slicer writes one voxel for a segmentation without any
+    if not numbers and len(labels) > 1:
+        raise make_refusal(
+            "sizes", list(values.shape), "several layers need segments with names, Segment0_Name"
+        )
+    if not numbers:
+        return LabelMap(labels, affine, name_labels(labels))
+    _check_representation(header)
+    _check_numbers(numbers)
+    segments = tuple(_read_segment(header, number) for number in range(len(numbers)))
+    image = LabelMap(labels, affine, segments)
+    for number, segment in enumerate(segments):
+        _check_extent(header, number, image.mask(segment))
+    return image
+
+
+def encode_nrrd(image: LabelMap) -> bytes:
+    """Return the contents of a `.seg.nrrd` file in LPS, with gzip."""
+    import nrrd
+
+    layers = len(image.labels)
+    affine = swap_affine(image.affine)
+    axes = affine[:3, :3].T
+    header: dict[str, Any] = {
+        "space": "left-posterior-superior",
+        "space directions": axes if layers == 1 else np.vstack([np.full(3, np.nan), axes]),
+        "space origin": affine[:3, 3],
+        "kinds": [*["list"][: layers - 1], "domain", "domain", "domain"],
+        "encoding": "gzip",
+        "Segmentation_ContainedRepresentationNames": f"{_BINARY}|",
+        **dict.fromkeys(_SOURCES, _BINARY),
+        _OFFSET: "0 0 0",
+    }
+    extent = " ".join(f"0 {size - 1}" for size in image.labels.shape[1:])
+    for number, each in enumerate(image.segments):
+        fields = {
+            "ID": f"Segment_{number + 1}",
+            "Name": each.name,
+            "LabelValue": each.label,
+            "Layer": each.layer,
+        }
+        for key, value in {**fields, "Extent": extent}.items():
+            header[f"Segment{number}_{key}"] = str(value)
+    labels = image.labels if image.labels.dtype.itemsize == 1 else image.labels.astype(np.int32)
+    file = BytesIO()
+    nrrd.write(file, labels if layers > 1 else labels[0], header)
+    return file.getvalue()
+
+
+def _read_affine(header: Mapping[str, Any], dimension: int) -> Floats:
+    """Return the map (4, 4) from voxels to RAS, mm."""
+    space = header.get("space")
+    if str(space).lower() not in _SPACES:
+        raise make_refusal("space", space, f"must be {' or '.join(name for name in _SPACES if '-' in name)}")
+    if units := {*header.get("space units", ())} - {"mm", ""}:
+        raise make_refusal("space units", sorted(units), "must be mm")
+    for field in ("space directions", "space origin"):
+        if field not in header:
+            raise InputError(f"no {field}: must be given, for each axis")
+    directions = np.array(header["space directions"], dtype=float)
+    origin = np.array(header["space origin"], dtype=float)
+    if directions.shape != (dimension, 3) or origin.shape != (3,):
+        raise make_refusal(
+            "space directions", directions.tolist(), f"must be {dimension} vectors of 3 numbers"
+        )
+    if dimension == 4 and not np.isnan(directions[0]).all():
+        raise make_refusal(
+            "space directions", directions.tolist(), "the first of four axes must be the list, none"
+        )
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = directions[-3:].T, origin
+    return swap_affine(affine) if _SPACES[str(space).lower()] == LPS else affine
+
+
+def _check_representation(header: Mapping[str, Any]) -> None:
+    """Raise InputError unless the segments are voxels with labels; the key has an old and a new name."""
+    for key in _SOURCES:
+        if header.get(key, _BINARY) != _BINARY:
+            raise make_refusal(key, header[key], f"must be {_BINARY}: convert it in 3D Slicer")
+
+
+def _check_numbers(numbers: set[int]) -> None:
+    """Raise InputError for a gap, since 3D Slicer reads segments up to the first one."""
+    gap = next(number for number in count() if number not in numbers)
+    if gap < len(numbers):
+        raise InputError(f"no Segment{gap}_Name, but Segment{max(numbers)}: segments must be numbered from 0")
+
+
+def _read_segment(header: Mapping[str, Any], number: int) -> Segment:
+    """Return a segment. Files before layers have one for each segment, with the label 1."""
+    start = f"Segment{number}_"
+    name = header.get(f"{start}Name") or header.get(f"{start}ID")
+    if not name:
+        raise InputError(f"no {start}Name: each segment must have a name")
+    (layer,) = _read_integers(header, f"{start}Layer", 1, str(number))
+    (label,) = _read_integers(header, f"{start}LabelValue", 1, "1")
+    return Segment(layer, label, str(name))
+
+
+def _read_integers(header: Mapping[str, Any], key: str, size: int, default: str) -> list[int]:
+    text = str(header.get(key, default))
+    if not re.fullmatch(r"\s*-?\d+" + r"\s+-?\d+" * (size - 1) + r"\s*", text):
+        raise make_refusal(key, text, f"must be {size} whole number{'s' if size > 1 else ''}")
+    return list(map(int, text.split()))
+
+
+def _check_extent(header: Mapping[str, Any], number: int, mask: NDArray[np.bool_]) -> None:
+    """Raise InputError for voxels outside the extent of their segment, which 3D Slicer would ignore.
+
+    Extents are voxels of the file, or in files of 3D Slicer 4 voxels of the reference image.
+    """
+    key = f"Segment{number}_Extent"
+    if key not in header or not mask.any():
+        return
+    extent = np.array(_read_integers(header, key, 6, "")).reshape(3, 2)
+    offset = np.array(_read_integers(header, _OFFSET, 3, "0 0 0"))
+    inside = np.argwhere(mask)
+    least, most = inside.min(axis=0), inside.max(axis=0)
+    if not any(
+        (shifted[:, 0] <= least).all() and (most <= shifted[:, 1]).all()
+        for shifted in (extent, extent - offset[:, None])
+    ):
+        bounds = " ".join(f"{low} {high}" for low, high in zip(least, most, strict=True))
+        raise make_refusal(key, header[key], f"must contain all voxels of the segment, {bounds}")
