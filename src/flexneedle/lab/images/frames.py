@@ -86,8 +86,9 @@ class ImageRegistration:
             raise make_refusal("rotation", self.rotation, "must be a unit quaternion w, x, y, z")
         if translation is None or not all(map(math.isfinite, translation)):
             raise make_refusal("translation", self.translation, "must be three numbers x, y, z (mm)")
-        if self.sd is not None and not 0.0 <= self.sd < math.inf:
-            raise make_refusal("sd", self.sd, "must be at least 0 (mm)")
+        sd = (0.0,) if self.sd is None else read_numbers((self.sd,), 1)
+        if sd is None or not 0.0 <= sd[0] < math.inf:
+            raise make_refusal("sd", self.sd, "must be a number, at least 0 (mm)")
 
     @staticmethod
     def of_matrix(matrix: ArrayLike, sd: float | None = None) -> "ImageRegistration":
@@ -148,4 +149,4 @@ def describe_import(registration: ImageRegistration, corners: Floats) -> str:
 
 
 def _join(values: Sequence[float] | Floats, digits: int = 2) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)
+    return " ".join(f"{value:z.{digits}f}" for value in values)

@@ -1,6 +1,6 @@
 """Label maps: voxels with whole numbers, some of which are named segments."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -74,9 +74,10 @@ class LabelMap:
         return corners
 
 
-def name_labels(labels: NDArray[Any]) -> tuple[Segment, ...]:
-    """Return a segment `Segment_N` for each label N in an image (i, j, k) without names, as 3D Slicer does."""
-    return tuple(Segment(0, int(label), f"Segment_{int(label)}") for label in np.unique(labels) if label != 0)
+def with_named_labels(image: LabelMap) -> LabelMap:
+    """Return the label map with a segment `Segment_N` for each label N in its one layer, as 3D Slicer names them."""
+    labels = [int(label) for label in np.unique(image.labels) if label != 0]
+    return replace(image, segments=tuple(Segment(0, label, f"Segment_{label}") for label in labels))
 
 
 def _check_labels(values: NDArray[Any]) -> NDArray[Any]:

@@ -27,6 +27,7 @@ _SCHEMA = (
 )
 _KNOWN_SCHEMA = re.compile(r"markups-schema-v1\.\d+\.\d+\.json#*$", re.IGNORECASE)
 _STATUS = ("defined", "undefined", "preview", "missing")
+_ROI_TYPES = ("Box", "BoundingBox")
 _UNITS = ("mm", ["mm", "UCUM", "millimeter"])
 _FCSV_FRAMES = {"0": RAS, "1": LPS, RAS: RAS, LPS: LPS}
 _FCSV_COLUMNS = "id,x,y,z,"
@@ -139,6 +140,9 @@ def _read_markup(given: Mapping[str, Any], name: str) -> Markup:
     found = tuple(_read_point(each, number, frame) for number, each in enumerate(points, 1))
     if kind not in (ROI, PLANE):
         return Markup(str(kind), called, found)
+    if (shape := given.get("roiType", "Box")) not in _ROI_TYPES or given.get("insideOut", False) is not False:
+        shape = shape if shape not in _ROI_TYPES else "inside out"
+        raise make_refusal("roiType", shape, f"must be {' or '.join(_ROI_TYPES)}, not inside out")
     size = None if "size" not in given else _read_vector("size", given["size"], 3)
     placement = _read_placement(given, frame)
     if placement is None and kind == PLANE:

@@ -103,16 +103,14 @@ def _choose_frame(comment: str, given: str | None) -> str:
 def _strip_obj(data: bytes) -> bytes:
     """Return only points and faces of an OBJ file, without textures and normals, which would split its points.
 
-    Raises InputError for indices that trimesh would misread.
+    Raises InputError for indices that are not of a point; trimesh would misread 0 and indices relative to a line.
     """
     lines = [line.strip() for line in data.splitlines()]
     points = [line for line in lines if line.startswith(b"v ")]
     faces = [re.sub(rb"/\S*", b"", line) for line in lines if line.startswith(b"f ")]
-    for face in faces:
-        for index in face.split()[1:]:
-            if not 1 <= abs(int(index)) <= len(points):
-                rule = f"must be from 1 to {len(points)}, or counted from the last point by -1"
-                raise make_refusal(face.decode(), int(index), rule)
+    for index in (int(index) for face in faces for index in face.split()[1:]):
+        if not 1 <= index <= len(points):
+            raise make_refusal("point of a face", index, f"must be from 1 to {len(points)}")
     return b"\n".join(points + faces)
 
 

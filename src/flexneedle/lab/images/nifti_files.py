@@ -9,7 +9,7 @@ import numpy as np
 from flexneedle.arguments import make_refusal
 from flexneedle.errors import InputError
 from flexneedle.lab.images.frames import check_matrix
-from flexneedle.lab.images.label_map import LabelMap, name_labels
+from flexneedle.lab.images.label_map import LabelMap, with_named_labels
 from flexneedle.types import Floats
 
 _SAME_MM = 0.01
@@ -28,7 +28,7 @@ def read_nifti(path: Path) -> LabelMap:
         raise make_refusal("dim", shape, "must be three axes")
     affine = _read_affine(image, shape[:3])
     labels = np.asanyarray(image.dataobj).reshape((1, *shape[:3]))
-    return LabelMap(labels, affine, name_labels(labels))
+    return with_named_labels(LabelMap(labels, affine, ()))
 
 
 def encode_nifti(image: LabelMap, *, zipped: bool) -> bytes:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flexneedle.arguments import make_refusal
 from flexneedle.errors import InputError
 from flexneedle.lab.images.frames import LPS, RAS, swap_affine
-from flexneedle.lab.images.label_map import LabelMap, Segment, name_labels
+from flexneedle.lab.images.label_map import LabelMap, Segment, with_named_labels
 from flexneedle.types import Floats
 
 _SPACES = {"left-posterior-superior": LPS, "lps": LPS, "right-anterior-superior": RAS, "ras": RAS}
@@ -41,7 +41,7 @@ def read_nrrd(path: Path) -> LabelMap:
             "sizes", list(values.shape), "several layers need segments with names, Segment0_Name"
         )
     if not numbers:
-        return LabelMap(labels, affine, name_labels(labels))
+        return with_named_labels(LabelMap(labels, affine, ()))
     _check_representation(header)
     _check_numbers(numbers)
     segments = tuple(_read_segment(header, number) for number in range(len(numbers)))
@@ -89,8 +89,9 @@ def _read_affine(header: Mapping[str, Any], dimension: int) -> Floats:
     space = header.get("space")
     if str(space).lower() not in _SPACES:
         raise make_refusal("space", space, f"must be {' or '.join(name for name in _SPACES if '-' in name)}")
-    if units := {*header.get("space units", ())} - {"mm", ""}:
-        raise make_refusal("space units", sorted(units), "must be mm")
+    for field in ("space units", "units"):
+        if units := {*header.get(field, ())} - {"mm", ""}:
+            raise make_refusal(field, sorted(units), "must be mm")
     for field in ("space directions", "space origin"):
         if field not in header:
             raise InputError(f"no {field}: must be given, for each axis")
