@@ -17,6 +17,9 @@ from flexneedle.lab.images.meshes import Mesh, read_mesh, write_mesh
 from flexneedle.lab.images.transforms import read_transform, write_transform
 from flexneedle.lab.images.volumes import read_label_map, write_label_map
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:datetime.datetime.utcnow:DeprecationWarning"
+)  # pynrrd's writer
 CUBE = np.ones((2, 3, 4), np.uint8)
 HEADER = {
     "space": "left-posterior-superior",

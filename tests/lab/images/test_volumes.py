@@ -11,11 +11,14 @@ from flexneedle.errors import InputError
 from flexneedle.lab.images.label_map import LabelMap, Segment
 from flexneedle.lab.images.volumes import READ, read_label_map, write_label_map
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:datetime.datetime.utcnow:DeprecationWarning"
+)  # pynrrd's writer
 OBLIQUE = np.array(
     [[0.6, -0.4, 0.0, -93.1], [0.3, 0.8, 0.0, 16.4], [0.0, 0.0, 5.0, -340.25], [0.0, 0.0, 0.0, 1.0]]
 )
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-SKIN, LIVER, VESSEL = Segment(0, 1, "skin"), Segment(0, 2, "liver"), Segment(1, 1, "vein, 3 mm")
+SKIN, LIVER, VESSEL = Segment(0, 1, "skin"), Segment(0, 2, "liver"), Segment(1, 1, "Gefäß, 3 mm")
 
 
 def blocks():
@@ -59,7 +62,7 @@ def test_overlapping_segments_come_back_with_layers_names_and_places(tmp_path):
     np.testing.assert_array_equal(found.labels, image.labels)
     np.testing.assert_allclose(found.affine, OBLIQUE, atol=1e-12)
     assert found.segments == image.segments
-    assert found.mask(found.find_segment("vein, 3 mm")).sum() == 3 * 3 * 2
+    assert found.mask(found.find_segment("Gefäß, 3 mm")).sum() == 3 * 3 * 2
     assert (found.mask(VESSEL) & found.mask(SKIN)).any()
 
 
@@ -207,6 +210,29 @@ def test_nifti_refuses_layers_and_other_suffixes_are_named(tmp_path):
     (tmp_path / "image.mha").write_text("")
     with pytest.raises(InputError, match=f"must end in {', '.join(READ)}"):
         read_label_map(tmp_path / "image.mha")
+
+
+@pytest.mark.parametrize("name", ["", " vein", "vein\nSegment0_Layer:=1"])
+def test_a_name_that_a_header_cannot_hold_is_not_written(tmp_path, name):
+    with pytest.raises(InputError, match=r"name of a segment = .*: must be printable"):
+        write_label_map(
+            LabelMap(np.ones((1, 2, 2, 2)), np.eye(4), (Segment(0, 1, name),)), tmp_path / "a.seg.nrrd"
+        )
+
+
+def test_labels_above_255_come_back(tmp_path):
+    image = LabelMap(np.arange(8).reshape(1, 2, 2, 2) * 1000, OBLIQUE, (Segment(0, 3000, "skin"),))
+    write_label_map(image, tmp_path / "a.seg.nrrd")
+    np.testing.assert_array_equal(read_label_map(tmp_path / "a.seg.nrrd").labels, image.labels)
+    np.testing.assert_array_equal(nrrd.read(str(tmp_path / "a.seg.nrrd"))[0], image.labels[0])
+
+
+def test_a_missing_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("flexneedle.arguments.find_spec", lambda _: None)
+    with pytest.raises(
+        InputError, match=r"nibabel and nrrd: not installed: pip install 'flexneedle\[images\]'"
+    ):
+        read_label_map(tmp_path / "image.nii")
 
 
 def test_a_sheared_affine_has_no_qform(tmp_path):

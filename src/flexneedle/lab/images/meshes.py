@@ -60,9 +60,9 @@ def read_mesh(path: str | PathLike[str], frame: str | None = None) -> Mesh:
         data = file.read_bytes()
         chosen = _choose_frame(_read_comment(data, suffix), frame)
         content = _strip_obj(data) if suffix == ".obj" else data
-        mesh = load_mesh(BytesIO(content), file_type=suffix[1:], process=False, maintain_order=True)
-        points, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
-        return Mesh(to_ras(points.reshape(-1, 3), chosen), triangles)
+        found: Any = load_mesh(BytesIO(content), file_type=suffix[1:], process=False, maintain_order=True)
+        points, triangles = (np.array(getattr(found, name, ())) for name in ("vertices", "faces"))
+        return Mesh(to_ras(points.astype(float).reshape(-1, 3), chosen), triangles.astype(np.int64))
 
 
 def write_mesh(mesh: Mesh, path: str | PathLike[str]) -> None:

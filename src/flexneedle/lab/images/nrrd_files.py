@@ -1,9 +1,9 @@
 """Label maps in NRRD files, and segmentations of 3D Slicer (`.seg.nrrd`) with overlapping segments in layers."""
 
+import gzip
 import re
 from collections.abc import Mapping
-from io import BytesIO
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ def read_nrrd(path: Path) -> LabelMap:
     import nrrd
 
     values, header = nrrd.read(str(path))
+    header = {**header, **_read_texts(path)}
     if values.ndim not in (3, 4):
         raise make_refusal("dimension", values.ndim, "must be 3, or 4 with a list axis first")
     affine = _read_affine(header, values.ndim)
@@ -52,36 +53,62 @@ def read_nrrd(path: Path) -> LabelMap:
 
 
 def encode_nrrd(image: LabelMap) -> bytes:
-    """Return the contents of a `.seg.nrrd` file in LPS, with gzip."""
-    import nrrd
+    """Return the contents of a `.seg.nrrd` file in LPS, with gzip. Raises InputError for an unprintable name.
 
-    layers = len(image.labels)
+    Not by pynrrd, which refuses names beyond ASCII and writes the time.
+    """
+    is_small = image.labels.dtype.itemsize == 1
+    lists = len(image.labels) > 1
     affine = swap_affine(image.affine)
-    axes = affine[:3, :3].T
-    header: dict[str, Any] = {
+    sizes = image.labels.shape if lists else image.labels.shape[1:]
+    fields = {
+        "type": "uchar" if is_small else "int",
+        "dimension": len(sizes),
         "space": "left-posterior-superior",
-        "space directions": axes if layers == 1 else np.vstack([np.full(3, np.nan), axes]),
-        "space origin": affine[:3, 3],
-        "kinds": [*["list"][: layers - 1], "domain", "domain", "domain"],
+        "sizes": " ".join(map(str, sizes)),
+        "space directions": " ".join([*["none"] * lists, *map(_vector, affine[:3, :3].T)]),
+        "kinds": " ".join([*["list"] * lists, "domain", "domain", "domain"]),
+        "endian": "little",
         "encoding": "gzip",
+        "space origin": _vector(affine[:3, 3]),
+    }
+    texts: dict[str, object] = {
         "Segmentation_ContainedRepresentationNames": f"{_BINARY}|",
         **dict.fromkeys(_SOURCES, _BINARY),
         _OFFSET: "0 0 0",
     }
     extent = " ".join(f"0 {size - 1}" for size in image.labels.shape[1:])
     for number, each in enumerate(image.segments):
-        fields = {
+        if not each.name.strip() == each.name != "" or not each.name.isprintable():
+            raise make_refusal(
+                "name of a segment", each.name, "must be printable, without blanks at its ends"
+            )
+        values = {
             "ID": f"Segment_{number + 1}",
             "Name": each.name,
             "LabelValue": each.label,
             "Layer": each.layer,
         }
-        for key, value in {**fields, "Extent": extent}.items():
-            header[f"Segment{number}_{key}"] = str(value)
-    labels = image.labels if image.labels.dtype.itemsize == 1 else image.labels.astype(np.int32)
-    file = BytesIO()
-    nrrd.write(file, labels if layers > 1 else labels[0], header)
-    return file.getvalue()
+        texts |= {f"Segment{number}_{key}": value for key, value in {**values, "Extent": extent}.items()}
+    lines = [
+        *(f"{key}: {value}" for key, value in fields.items()),
+        *(f"{key}:={texts[key]}" for key in texts),
+    ]
+    voxels = image.labels.astype("u1" if is_small else "<i4")
+    start = "\n".join(["NRRD0004", *lines, "\n"]).encode()
+    return start + gzip.compress((voxels if lists else voxels[0]).tobytes(order="F"), mtime=0)
+
+
+def _vector(row: Floats) -> str:
+    return f"({','.join(map(repr, row.tolist()))})"
+
+
+def _read_texts(path: Path) -> dict[str, str]:
+    """Return the keys and values of a header, which pynrrd reads without characters beyond ASCII."""
+    with path.open("rb") as file:
+        lines = list(takewhile(bytes.strip, file))
+    pairs = (line.decode(errors="replace").partition(":=") for line in lines if line[:1] != b"#")
+    return {key.strip(): value.strip() for key, mark, value in pairs if mark}
 
 
 def _read_affine(header: Mapping[str, Any], dimension: int) -> Floats:
@@ -152,8 +179,8 @@ def _check_extent(header: Mapping[str, Any], number: int, mask: NDArray[np.bool_
         return
     extent = np.array(_read_integers(header, key, 6, "")).reshape(3, 2)
     offset = np.array(_read_integers(header, _OFFSET, 3, "0 0 0"))
-    inside = np.argwhere(mask)
-    least, most = inside.min(axis=0), inside.max(axis=0)
+    inside = [np.flatnonzero(mask.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    least, most = (np.array([indices[end] for indices in inside]) for end in (0, -1))
     if not any(
         (shifted[:, 0] <= least).all() and (most <= shifted[:, 1]).all()
         for shifted in (extent, extent - offset[:, None])
