@@ -31,7 +31,7 @@ _ROI_TYPES = ("Box", "BoundingBox")
 _UNITS = ("mm", ["mm", "UCUM", "millimeter"])
 _FCSV_FRAMES = {"0": RAS, "1": LPS, RAS: RAS, LPS: LPS}
 _FCSV_COLUMNS = "id,x,y,z,"
-_FCSV_STATUS, _FCSV_DEFINED = 14, "2"  # a column without name, since 4.11
+_FCSV_STATUS, _FCSV_DEFINED = 14, "2"  # a column without name, of newer files
 _SAME = 1e-3  # largest difference of the normal of a plane from its third axis
 
 

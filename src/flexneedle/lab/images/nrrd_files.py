@@ -17,7 +17,7 @@ from flexneedle.lab.images.label_map import LabelMap, Segment, with_named_labels
 from flexneedle.types import Floats
 
 _SPACES = {"left-posterior-superior": LPS, "lps": LPS, "right-anterior-superior": RAS, "ras": RAS}
-_SOURCES = ("Segmentation_SourceRepresentation", "Segmentation_MasterRepresentation")  # since and before 5.2
+_SOURCES = ("Segmentation_SourceRepresentation", "Segmentation_MasterRepresentation")  # new and old
 _BINARY = "Binary labelmap"
 _OFFSET = "Segmentation_ReferenceImageExtentOffset"
 _FIELD = re.compile(r"Segment(\d+)_\w+")
@@ -172,7 +172,7 @@ def _read_integers(header: Mapping[str, Any], key: str, size: int, default: str)
 def _check_extent(header: Mapping[str, Any], number: int, mask: NDArray[np.bool_]) -> None:
     """Raise InputError for voxels outside the extent of their segment, which 3D Slicer would ignore.
 
-    Extents are voxels of the file, or in files of 3D Slicer 4 voxels of the reference image.
+    Extents are voxels of the file, or in old files voxels of the reference image.
     """
     key = f"Segment{number}_Extent"
     if key not in header or not mask.any():
