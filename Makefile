@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets plan-reach front calibration wide worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets plan-reach front calibration wide worlds space worlds-space tuning slicer docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -176,6 +176,9 @@ tuning: setup  ## tune each controller with 200 insertions; writes studies/tunin
 
 slow: kernels  ## the longest tests: a thousand insertions against the reference, every fault of a device, examples of the docs
 	$(BIN)/python -m pytest -m slow $(or $(call quick,tests/simulator/test_reference.py -k test_random_insertions_agree[4-1]),-n auto --dist worksteal) $(PYTEST_ARGS)
+
+slicer: setup  ## check files of images against slicerio and the scene of 3D Slicer, if pip has installed slicerio and slicer-core
+	$(BIN)/python tests/lab/images/slicer_by_hand.py
 
 docs: setup  ## build the documentation site into site/; warnings are errors
 	$(call quick,mkdir -p $(OUT) && cp -r docs src tools zensical.toml $(OUT))

@@ -1,0 +1,1 @@
+"""Files of medical images: label maps, meshes, markups and transforms of 3D Slicer; their frames."""
