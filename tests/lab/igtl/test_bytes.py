@@ -116,6 +116,14 @@ def test_trajectory_may_lack_an_end(entry, target, kind):
     assert Decoder().feed(pack(message)) == [message]
 
 
+def test_an_entry_is_read_from_a_trajectory_that_the_cpp_library_calls_target_only():
+    path = Trajectory(name="", entry=(1.0, 2.0, 3.0), target=(0.0, 0.0, 0.0))
+    content = bytearray(TrajectoryMessage(name="a", trajectories=(path,)).encode())
+    content[96] = 2
+    (read,) = Decoder().feed(framed("TRAJ", bytes(content)))
+    assert read.trajectories == (path,)
+
+
 def test_position_has_the_quaternion_with_w_last():
     message = PositionMessage(name="a", position=(1.0, 2.0, 3.0), orientation=(0.5, -0.5, 0.25, 0.0))
     floats = "3f800000 40000000 40400000 bf000000 3e800000 00000000 3f000000"

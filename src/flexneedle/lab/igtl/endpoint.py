@@ -1,6 +1,7 @@
 """Server and client with one interface. Methods must be called in the event loop's thread."""
 
 import asyncio
+import os
 from abc import abstractmethod
 from contextlib import suppress
 from typing import Self
@@ -113,7 +114,7 @@ class IgtlClient(Endpoint):
                 last = ""
                 await asyncio.shield(peer.closed)
             except OSError as error:
-                why = error.strerror or str(error)
+                why = os.strerror(error.errno) if (error.errno or 0) > 0 else str(error)
                 if why != last:
                     self._log(f"{self.host}:{self.port}: no connection, trying again: {why}")
                 last = why

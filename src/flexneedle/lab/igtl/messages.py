@@ -143,7 +143,11 @@ def _decode_point(values: Sequence[Any]) -> NamedPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """One trajectory of a TRAJ message; without an entry or without a target, the other must be given."""
+    """One trajectory of a TRAJ message, with an entry, a target or both.
+
+    The C++ library sends both points as type 2, target only, unless its caller sets the type; therefore a point that
+    the type excludes is read unless it is 0, 0, 0.
+    """
 
     name: str
     entry: Point | None
@@ -183,11 +187,12 @@ def _encode_trajectory(one: Trajectory) -> bytes:
 def _decode_trajectory(values: Sequence[Any]) -> Trajectory:
     name, group, kind, *rest, owner = values
     _check_kind(kind)
-    x1, y1, z1, x2, y2, z2, radius = _finite(rest[4:])
+    *ends, radius = _finite(rest[4:])
+    entry, target = (ends[0], ends[1], ends[2]), (ends[3], ends[4], ends[5])
     return Trajectory(
         name=_read_text(name),
-        entry=(x1, y1, z1) if kind & _ENTRY else None,
-        target=(x2, y2, z2) if kind & _TARGET else None,
+        entry=entry if kind & _ENTRY or any(entry) else None,
+        target=target if kind & _TARGET or any(target) else None,
         group=_read_text(group),
         color=(rest[0], rest[1], rest[2], rest[3]),
         radius=radius,
