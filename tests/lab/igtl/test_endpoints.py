@@ -54,9 +54,9 @@ async def raw(server, *, window=0):
         yield one
 
 
-async def read(one, size=65_536):
+async def read(one):
     async with asyncio.timeout(20):
-        return await asyncio.get_running_loop().sock_recv(one, size)
+        return await asyncio.get_running_loop().sock_recv(one, 65_536)
 
 
 def tip(number):
@@ -99,7 +99,7 @@ def test_a_stalled_client_delays_no_other_and_gets_the_newest_of_each_name():
                 server.send(replace(tip(number), name="Guide"))
                 await asyncio.sleep(0)
             await until(lambda: all(len(log.messages) == 6000 for log in logs))
-            (behind,) = (peer for peer in server.peers if peer._waiting)
+            (behind,) = (peer for peer in server.peers if peer.behind)
             assert list(behind._waiting) in (
                 [("TRANSFORM", "Tip"), ("TRANSFORM", "Guide")],
                 [("TRANSFORM", "Guide"), ("TRANSFORM", "Tip")],
@@ -227,7 +227,7 @@ def test_a_server_that_is_not_there_is_reported_once_until_it_is(monkeypatch):
 def test_a_server_ends_although_a_client_reads_nothing():
     async def scenario():
         async with serving() as (server, _), raw(server, window=4096):
-            while not any(peer._waiting for peer in server.peers):
+            while not any(peer.behind for peer in server.peers):
                 server.send(tip(0))
         assert not server.peers
 

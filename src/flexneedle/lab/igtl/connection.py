@@ -52,6 +52,11 @@ class PeerConnection(asyncio.BufferedProtocol):
         """Send a frame now, or as soon as the peer reads."""
         self._offer(frame.key, frame)
 
+    @property
+    def behind(self) -> int:
+        """Frames that wait, because the peer does not read fast enough."""
+        return len(self._waiting)
+
     def close(self) -> None:
         """Close, without waiting for a peer that does not read."""
         self._transport.abort() if self._blocked else self._transport.close()
