@@ -233,7 +233,9 @@ def test_contents_that_break_a_rule_are_skipped(kind, content, version, reason):
 
 def test_an_extended_header_may_be_longer_and_have_no_metadata():
     content = struct.pack(">HHII", 14, 0, 0, 7) + b"\xff\xff" + b"\0\3\0\1x"
-    assert Decoder().feed(framed("STRING", content, 3)) == [StringMessage(name="a", text="x")]
+    decoder = Decoder()
+    assert decoder.feed(framed("STRING", content, 3)) == [StringMessage(name="a", text="x")]
+    assert decoder.version == 2
 
 
 def test_the_order_of_a_received_line_is_kept():

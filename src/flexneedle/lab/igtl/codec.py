@@ -13,7 +13,7 @@ from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.igtl.crc import crc64
 from flexneedle.lab.igtl.messages import MESSAGES, Message
 
-MOST_BYTES = 1 << 20
+MOST_BYTES = 1 << 18
 """Largest body of a message that is read."""
 MOST_SKIPPED = 1 << 30
 """Largest body of other types, as images; it is not stored."""
