@@ -24,9 +24,8 @@ class Frame:
 
     def __init__(self, message: Message) -> None:
         self.key = message.type, message.name
-        versions = (
-            (1, 2) if message.metadata else (1,)
-        )  # InputError is raised here, not while a peer is served
+        # Metadata may not fit: InputError is raised here, not while a peer is served.
+        versions = (1, 2) if message.metadata else (1,)
         self._message, self._packets = message, {version: pack(message, version) for version in versions}
 
     def packet(self, version: int) -> bytes:
