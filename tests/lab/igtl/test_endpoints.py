@@ -231,7 +231,9 @@ def test_a_server_ends_although_a_client_reads_nothing():
         async with AsyncExitStack() as client:
             async with asyncio.timeout(20), serving() as (server, _):
                 await client.enter_async_context(raw(server, window=4096))
-                while sum(peer.dropped for peer in server.peers) < 5000:  # the kernel takes some more at first
+                while (
+                    sum(peer.dropped for peer in server.peers) < 5000
+                ):  # the kernel takes some more at first
                     server.send(tip(0))
                     await asyncio.sleep(0)
             assert not server.peers

@@ -114,7 +114,7 @@ class IgtlClient(Endpoint):
                 last = ""
                 await asyncio.shield(peer.closed)
             except OSError as error:
-                why = os.strerror(error.errno) if (error.errno or 0) > 0 else str(error)
+                why = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)
                 if why != last:
                     self._log(f"{self.host}:{self.port}: no connection, trying again: {why}")
                 last = why
