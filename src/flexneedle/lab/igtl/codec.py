@@ -9,9 +9,9 @@ import struct
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from flexneedle.errors import InputError, make_printable
+from flexneedle.errors import InputError
 from flexneedle.lab.igtl.crc import crc64
-from flexneedle.lab.igtl.messages import MESSAGES, Message
+from flexneedle.lab.igtl.messages import MESSAGES, Message, read_text
 
 MOST_BYTES = 1 << 18
 """Largest body of a message that is read."""
@@ -96,6 +96,11 @@ class _Header(NamedTuple):
     size: int
     crc: int
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it is read: a message, or a query."""
+        return self.type in MESSAGES or self.type.startswith(_QUERIES)
+
 
 class _Garbage(Exception):
     """Bytes that are not OpenIGTLink."""
@@ -134,7 +139,7 @@ class Decoder:
         if self._skip or len(self._data) < _HEADER.size:
             return None
         header = self._read_header()
-        if header.type not in MESSAGES and not header.type.startswith(_QUERIES):
+        if not header.is_known:
             self._skip = _HEADER.size + header.size
             return Skipped(header.type, header.name, "not supported")
         return self._read_body(header)
@@ -146,12 +151,11 @@ class Decoder:
             raise _Garbage(f"header version {version}: must be 1 to 3")
         if not _TYPE.fullmatch(kind):
             raise _Garbage(f"type {kind!r}: must be ASCII")
-        known = kind.decode() in MESSAGES or kind.decode().startswith(_QUERIES)
-        if size > (most := MOST_BYTES if known else MOST_SKIPPED):
-            raise _Garbage(f"{kind.decode()} of {size} bytes: must be at most {most}")
+        header = _Header(version, kind.decode(), read_text(name), stamp / _SECOND, size, crc)
+        if size > (most := MOST_BYTES if header.is_known else MOST_SKIPPED):
+            raise _Garbage(f"{header.type} of {size} bytes: must be at most {most}")
         self.version = max(self.version, min(version, 2))
-        device = make_printable(name.partition(b"\0")[0].decode(errors="replace"))
-        return _Header(version, kind.decode(), device, stamp / _SECOND, size, crc)
+        return header
 
     def _read_body(self, header: _Header) -> Received | None:
         end = _HEADER.size + header.size

@@ -132,12 +132,12 @@ def _decode_point(values: Sequence[Any]) -> NamedPoint:
     name, group, *rest, owner = values
     x, y, z, diameter = _finite(rest[4:])
     return NamedPoint(
-        name=_read_text(name),
+        name=read_text(name),
         position=(x, y, z),
-        group=_read_text(group),
+        group=read_text(group),
         color=(rest[0], rest[1], rest[2], rest[3]),
         diameter=diameter,
-        owner=_read_text(owner),
+        owner=read_text(owner),
     )
 
 
@@ -190,13 +190,13 @@ def _decode_trajectory(values: Sequence[Any]) -> Trajectory:
     *ends, radius = _finite(rest[4:])
     entry, target = (ends[0], ends[1], ends[2]), (ends[3], ends[4], ends[5])
     return Trajectory(
-        name=_read_text(name),
+        name=read_text(name),
         entry=entry if kind & _ENTRY or any(entry) else None,
         target=target if kind & _TARGET or any(target) else None,
-        group=_read_text(group),
+        group=read_text(group),
         color=(rest[0], rest[1], rest[2], rest[3]),
         radius=radius,
-        owner=_read_text(owner),
+        owner=read_text(owner),
     )
 
 
@@ -263,8 +263,8 @@ class StatusMessage(Message):
         if len(content) < _STATUS.size:
             raise InputError(f"{len(content)} bytes: must be at least {_STATUS.size}")
         code, subcode, error = _STATUS.unpack_from(content)
-        text = _read_text(content[_STATUS.size :])
-        return cls(code=code, subcode=subcode, error=_read_text(error), text=text, **header)
+        text = read_text(content[_STATUS.size :])
+        return cls(code=code, subcode=subcode, error=read_text(error), text=text, **header)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,7 +312,8 @@ def _text(text: str, size: int) -> bytes:
     return data.ljust(size, b"\0")
 
 
-def _read_text(data: bytes) -> str:
+def read_text(data: bytes) -> str:
+    """Return the text of a field up to its first zero byte; bytes that are no UTF-8 are replaced."""
     return data.partition(b"\0")[0].decode(errors="replace")
 
 
