@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 
 from flexneedle import Simulator, controls
+from flexneedle.mechanics import zones
 from flexneedle.mechanics.model import Adaptation, pack
 from flexneedle.mechanics.rollout import Outputs
 from flexneedle.mechanics.work import workspace
@@ -35,6 +36,19 @@ def for_numbers() -> Iterator[None]:
     """Run rollouts with the kernels compiled for numbers, needle by needle."""
     with mock.patch.object(batch, "_workspace", partial(workspace, lanes=False)):
         yield
+
+
+_AXES = np.stack(np.meshgrid(*[np.arange(-6.0, 7.0)] * 3, indexing="ij"))
+ZONES = zones.pack(
+    [
+        zones.capsule((10.0, 2.0, 1.0), (20.0, -3.0, 0.0), 2.0),
+        zones.box((30.0, -2.0, 0.0), (3.0, 1.0, 2.0), radius=0.5),
+        zones.half_space((42.0, 0.0, 0.0), (-1.0, 0.1, 0.0)),
+        zones.grid(np.linalg.norm(_AXES, axis=0) - 3.0, (19.0, -6.0, -6.0), (1.0, 1.0, 1.0)),
+    ],
+    5.0,
+)
+"""One of each shape, where the needles pass."""
 
 
 def draw_insertions(axes: int, count: int, steps: int, rng: np.random.Generator) -> list[Insertion]:
@@ -74,12 +88,12 @@ def run_together(insertions: Sequence[Insertion], threads: int = 1) -> list[dict
     rows = drive(states, np.stack([one.rows for one in insertions]))
     wanted = {"every_step": batch.COLUMNS, "ends": True}
     with mock.patch.object(batch, "_STEPS_WORTH_A_THREAD", 1):
-        out = batch.run(packed, own, starts, own, rows, axes, threads, **wanted)
+        out = batch.run(packed, own, starts, own, rows, axes, ZONES, threads, **wanted)
     return [_bytes_of(out, k, one) for k, one in enumerate(insertions)]
 
 
 def _bytes_of(out: Outputs, k: int, one: Insertion) -> dict[str, bytes]:
-    names = ("tips", "converged", "energy", "stretch", "deflection", "loads", "strain")
+    names = ("tips", "converged", "energy", "stretch", "deflection", "loads", "strain", "clearance")
     arrays = {name: getattr(out, name)[k] for name in names}
     arrays["curves"] = out.curves[k, :, : one.simulator.model.nodes.size + 2]
     if np.isfinite(out.ends.needles[k]).all():

@@ -12,6 +12,7 @@ from reference.cases import insert_to, repeat
 from reference.side_by_side import (
     NEVER_SOLVED,
     NOT_A_NUMBER,
+    ZONES,
     draw_insertions,
     for_numbers,
     run_together,
@@ -64,6 +65,7 @@ def test_no_output_reads_what_memory_held_before():
         rows[:, :, 0] += simulator.model.nodes["x"][node] - tips + 1e-7
     simulator.rollout(state, rows[:1])
     batch._memory.space.laterals[:] = np.nan
+    simulator = Simulator("phantom", threads=1, zones=ZONES)
     found = simulator.rollout(state, rows, outputs=batch.COLUMNS, ends=True, limits=False)
     past = found.tips[:, 0, 0] > simulator.model.nodes["x"][node]
     assert sum(end.mesh.size == node for end, is_past in zip(found.ends, past, strict=True) if is_past) > 3
