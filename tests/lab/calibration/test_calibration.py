@@ -1,6 +1,7 @@
 """Calibrations of insertions that the model itself has made: parameters, intervals, and what is not identified."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from flexneedle.lab.calibration.calibration import calibrate
 from flexneedle.lab.calibration.criteria import Likelihood, PredictionErrors
 from flexneedle.lab.calibration.files import read_record, write_calibration
 from flexneedle.lab.calibration.fit import Problem, fit, residuals_at
-from flexneedle.lab.calibration.parameters import make_needle, parameters_of, trial_of
+from flexneedle.lab.calibration.intervals import jackknife
+from flexneedle.lab.calibration.parameters import at_same_curvature, make_needle, parameters_of, trial_of
 from flexneedle.lab.calibration.prediction import STEEP, Replay, fitting_scenario, shallow
 from flexneedle.lab.calibration.session import Session
 from flexneedle.scenario.files import load_scenario
@@ -267,6 +269,36 @@ def test_derivatives_of_residuals_are_those_of_finite_differences(guided):
         expected = np.concatenate([a - b for a, b in zip(down.values, up.values, strict=True)]) / (2 * h)
         given = np.concatenate(found.slopes)[:, k]
         assert np.abs(given - expected).max() < 0.1 * np.abs(expected).max() + 1e-6, k
+
+
+def test_a_point_without_a_recording_is_that_of_a_fit_without_it(guided, fitted):
+    found, sd = fitted.fitted, np.sqrt(np.diag(np.linalg.inv(fitted.fitted.information)))[:4]
+    for n in (1, 3):
+        left = problem_of(guided.select([k != n for k in range(5)]))
+        again = fit(left, Likelihood, found.point, found.noise, rounds=1)
+        assert (np.abs(again.point - found.without[n])[:4] < 0.6 * sd).all()
+        assert (np.abs(again.point - found.point)[:4] > 0.05 * sd).any()
+
+
+def test_the_variance_of_a_mean_by_jackknife():
+    """Without one of n numbers each, the mean has the variance s²/n of the numbers themselves."""
+    numbers = np.array([1.0, 4.0, -2.0, 7.0, 0.5])
+    without = (numbers.sum() - numbers) / 4.0
+    covariance = jackknife(SimpleNamespace(without=without[:, None]))
+    assert covariance[0, 0] == pytest.approx(numbers.var(ddof=1) / 5.0)
+
+
+def test_starts_of_another_stiffness_have_the_same_curvature():
+    session = Session((blank("a", "0", np.zeros((25, 1)), 5.0 * np.arange(25)),))
+    scenario = fitting_scenario(load_scenario("gel"), session)
+    parameters = parameters_of(scenario, ("stiffness", "bevel"), 120.0)
+    start = np.array([each.start for each in parameters])
+    stiffer = np.add(at_same_curvature(parameters, start, np.log(10.0)), [np.log(10.0), 0.0])
+    assert stiffer[1] < 0.5 * start[1]
+    needles = [make_needle(scenario, trial_of(scenario, parameters, each)) for each in (start, stiffer)]
+    tips, _ = Replay.of(session).predict(needles)
+    turns = tips[:, 0, -1, 3] - tips[:, 0, 12, 3]
+    assert turns[1] == pytest.approx(turns[0], rel=0.1)
 
 
 def test_a_roll_during_the_insertion_is_carried_out():
