@@ -41,7 +41,7 @@ class Problem:
 
     @property
     def moves(self) -> bool:
-        """Whether guide or base moves in a recording."""
+        """True if guide or base moves in a recording."""
         return not all(one.rests for one in self.replay.recordings)
 
     @cached_property

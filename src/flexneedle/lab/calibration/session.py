@@ -73,13 +73,13 @@ class Recording:
 
     @property
     def rests(self) -> bool:
-        """Whether guide and base rest."""
+        """True if guide and base rest."""
         base = np.linalg.norm(self.base - self.base[0], axis=1).max()
         return bool(max(self.guide_moves, base) < STILL)
 
     @cached_property
     def moved(self) -> Flags:
-        """Whether guide, base or roll moved (k,) since the step before."""
+        """Steps (k,) before which guide, base or roll moved."""
         change = np.column_stack([self.guide, self.base, self.roll])
         return np.append(False, (np.abs(np.diff(change, axis=0)) > STILL).any(axis=1))
 

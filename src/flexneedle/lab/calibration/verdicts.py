@@ -68,7 +68,7 @@ class Row:
 
     @property
     def main(self) -> bool:
-        """Whether the row is of all, of guided predictions, or of the end."""
+        """True for all predictions, guided ones, and the end."""
         return self.group in ("all", END) or self.group.startswith(GUIDED)
 
     def values(self) -> dict[str, Any]:

@@ -98,7 +98,7 @@ class _Header(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether it is read: a message, or a query."""
+        """True for what is read: a message, or a query."""
         return self.type in MESSAGES or self.type.startswith(_QUERIES)
 
 
