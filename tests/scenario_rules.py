@@ -49,6 +49,8 @@ NOT_NEGATIVE += _keys("""
     control.ce_mpc: orientation_weight_mm curvature_per_m flip_dead_band
     control.resolved_rate: curvature_per_m flip_dead_band gain damping
     entry: free_radius_mm free_slope_mrad
+    guard: zone_buffer_mm
+    image: sd_mm
     monitor: jump_margin_mm lost_after_s
     needle: inner_diameter_mm
     needle.bevel: offset_mm
@@ -60,6 +62,7 @@ NOT_NEGATIVE += _keys("""
     plan: advance_sigma_mm guide_sigma_mm base_sigma_mm base_turn_sigma_mrad smoothing
     tissue[0]: energy_weight
     tracker: jitter_mm tip_offset_mm
+    zones: margin_mm
 """)
 COUNTS = {
     "monitor.references": (0, 100),
@@ -166,6 +169,8 @@ RULES = [
     ("contact.spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("phantom.contact_spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("phantom.step_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
+    ("image.rotation", [1.0, 1.0, 0.0, 0.0], "must be a unit quaternion w, x, y, z; its length is 1.41421"),
+    ("image.translation_mm[0]", 1e7, "must be at most 1e+06"),
     ("tracker.workspace_center_mm[0]", 1e7, "must be at most 1e+06"),
     ("tracker.rate_hz", 1e6, "must be at most 50000, 10000 readings in a control step"),
     ("setup.guide_speed_mm_s", 1e-3, "must be at least 0.002, 10000 readings in a motion by 0.5"),

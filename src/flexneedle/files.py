@@ -1,5 +1,6 @@
 """Files that are complete at any time, and new folders."""
 
+import hashlib
 import os
 import re
 from datetime import UTC, datetime
@@ -11,6 +12,12 @@ from flexneedle.interrupts import delay_signals
 
 RUNS = Path("runs")
 _LONGEST_NAME = 60
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def replace_file(path: Path, data: bytes) -> None:

@@ -67,7 +67,9 @@ class Plan:
         scenario: Scenario of the plan, None if unknown.
         versions: Versions that made a loaded plan, by package; empty for a new one.
         least_stretch: Least stretch λ of the tissue (m + 1,); NaN (1,): unknown.
-        refusal: Load of needle or tissue for which the guard would refuse the plan, else "".
+        refusal: Load of needle or tissue, or zone, for which the plan must not be carried out, else "".
+        clearance: Least clearance of the inserted needle from the zones to avoid after each step (m + 1,), mm, a bound:
+            see `simulator.zones`; infinite before the skin and without zones.
     """
 
     strategy: str
@@ -90,6 +92,12 @@ class Plan:
     versions: Mapping[str, str] = field(default_factory=dict, compare=False)
     least_stretch: Floats = field(default_factory=lambda: np.full(1, math.nan))
     refusal: str = ""
+    clearance: Floats = field(default_factory=lambda: np.full(1, math.inf))
+
+    @property
+    def least_clearance_mm(self) -> float:
+        """Least clearance from the zones to avoid over the whole plan; infinite without zones."""
+        return float(self.clearance.min())
 
     @property
     def tip_mm(self) -> Point:
@@ -227,6 +235,9 @@ class Period:
     readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
     late: bool = False  # whether the decision came after the deadline, so that the needle rested
     energy_scale: float = math.nan  # E₁ (mJ): see `Scenario.energy_scale`
+    clearance: float = (
+        math.inf
+    )  # of the estimated needle from the zones to avoid (mm), a bound; infinite without zones
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flexneedle.mechanics.compile import inner
+from flexneedle.mechanics.compile import inner, kernel
 from flexneedle.mechanics.lanes import least, load, magnitude, most, root, row_of, select, some, whole
 from flexneedle.mechanics.lateral import y_of, z_of
 from flexneedle.mechanics.needle import NeedleState
@@ -115,6 +115,16 @@ def least_distance(w: Needles, zones: Zones, needle: NeedleState, count: int) ->
                 here = distance_from(row, zones.fields, x, y_of(y), z_of(y))
                 found = select(near, least(found, here), found)
     return found
+
+
+@kernel
+def fill_distances(zones: Zones, points: Floats, distances: Floats) -> None:
+    """Set the distances (z, n), mm, of points (n, 3) from each zone, at any distance."""
+    for k in range(zones.rows.shape[0]):
+        for i in range(points.shape[0]):
+            distances[k, i] = distance_from(
+                zones.rows[k], zones.fields, points[i, 0], points[i, 1], points[i, 2]
+            )
 
 
 # ---- making zones

@@ -1,12 +1,14 @@
 """Scenario files by name or path; also files of environments and registrations."""
 
 from pathlib import Path
+from typing import Any
 
 import tomli_w
 from pydantic import ValidationError
 
-from flexneedle.arguments import shorten
+from flexneedle.arguments import expand_home, shorten
 from flexneedle.errors import ScenarioError
+from flexneedle.files import digest_of
 from flexneedle.scenario.library import PRESETS, Library, is_world, label
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import describe
@@ -33,7 +35,24 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
         from flexneedle.scenario.worlds import named_world
 
         return named_world(source)
-    return Scenario.from_values(PRESETS.read(source), label(source))
+    return Scenario.from_values(_with_files(PRESETS.read(source), source), label(source))
+
+
+def _with_files(values: dict[str, Any], source: str | Path) -> dict[str, Any]:
+    """Return the tables of a scenario with the paths of its zones' files from its own folder, and their SHA-256."""
+    zones = values.get("zone")
+    if not isinstance(zones, list):
+        return values
+    folder = expand_home(source).absolute().parent
+    return {**values, "zone": [_with_file(zone, folder) for zone in zones]}
+
+
+def _with_file(zone: Any, folder: Path) -> Any:
+    if not isinstance(zone, dict) or not isinstance(zone.get("file"), str):
+        return zone
+    path = folder / expand_home(zone["file"])
+    known = {} if "sha256" in zone or not path.is_file() else {"sha256": digest_of(path)}
+    return {**zone, "file": str(path), **known}
 
 
 def load_environment(source: str | Path) -> Environment:

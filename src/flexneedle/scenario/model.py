@@ -19,6 +19,7 @@ from flexneedle.scenario.rules import (
     monitor_problems,
     plan_problems,
     target_problems,
+    zone_problems,
 )
 from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
 from flexneedle.scenario.sections.environment import ENVIRONMENTS, expand_environment
@@ -27,6 +28,7 @@ from flexneedle.scenario.sections.monitor import GuardSettings, MonitorSettings
 from flexneedle.scenario.sections.needle import Needle
 from flexneedle.scenario.sections.settings import ControlSettings, PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.structure import structure_problems
+from flexneedle.scenario.sections.zones import AnyZone, ImageSettings, ZoneSettings
 from flexneedle.scenario.tissue.laws import AnyLayer
 from flexneedle.scenario.tissue.layer import Contact
 
@@ -56,6 +58,10 @@ class Scenario(Section):
     contact: Contact = Contact()
     entry: Entry = Entry()
     target: Target = Target()
+    image: ImageSettings = ImageSettings()
+    zones: ZoneSettings = ZoneSettings()
+    zone: Annotated[tuple[AnyZone, ...], Field(strict=False, max_length=1_000)] = ()
+    """Zones to avoid."""
     plan: PlanSettings = PlanSettings()
     control: ControlSettings = ControlSettings()
     tracker: TrackerSettings = TrackerSettings()
@@ -78,6 +84,7 @@ class Scenario(Section):
                 layer_problems(self.tissue, self.needle.bevel),
                 entry_problems(self.setup, self.entry),
                 target_problems(self.setup, self.entry, self.target),
+                zone_problems(self.zone, self.zones, self.guard),
                 plan_problems(self.plan),
                 monitor_problems(self.monitor, self.tracker),
                 grid_problems(self.setup, self.contact, self.phantom, self.tracker),
@@ -104,7 +111,8 @@ class Scenario(Section):
 
     def values(self) -> dict[str, Any]:
         """Return nested tables, with all defaults, without the keys that are not set."""
-        return self.model_dump(mode="json", exclude_none=True)
+        values = self.model_dump(mode="json", exclude_none=True)
+        return values if self.zone else {name: value for name, value in values.items() if name != "zone"}
 
     def with_values(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with values replaced by dotted key (`tissue.0.alpha`); None removes a key.

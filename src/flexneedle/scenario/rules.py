@@ -5,9 +5,10 @@ from math import isfinite
 
 from flexneedle.scenario.problems import Problem
 from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
-from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.scenario.sections.monitor import GuardSettings, MonitorSettings
 from flexneedle.scenario.sections.needle import Bevel, Needle
 from flexneedle.scenario.sections.settings import PhantomSettings, PlanSettings, Target
+from flexneedle.scenario.sections.zones import Zone, ZoneFile, ZoneSettings
 from flexneedle.scenario.tissue.layer import Contact, Layer
 
 _MOST_GRID_POINTS = 20_000
@@ -72,6 +73,17 @@ def entry_problems(setup: Setup, entry: Entry) -> Iterator[Problem]:
     for key in ("lateral_z_mm", "slope_z_mrad"):
         if setup.axes == 1 and (value := getattr(entry, key)) != 0.0:
             yield Problem(f"entry.{key}", value, "must be 0 with setup.axes = 1")
+
+
+def zone_problems(zones: Sequence[Zone], settings: ZoneSettings, guard: GuardSettings) -> Iterator[Problem]:
+    """Yield margins that the guard would not let a plan use, and files of zones with both a segment and a label."""
+    for i, zone in enumerate(zones):
+        margin = settings.margin_mm if zone.margin_mm is None else zone.margin_mm
+        if margin < guard.zone_buffer_mm:
+            key = "zones.margin_mm" if zone.margin_mm is None else f"zone.{i}.margin_mm"
+            yield Problem(key, margin, f"must be at least guard.zone_buffer_mm ({guard.zone_buffer_mm:g})")
+        if isinstance(zone, ZoneFile) and zone.segment is not None and zone.label is not None:
+            yield Problem(f"zone.{i}.label", zone.label, "leave it out: segment names the voxels")
 
 
 def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Problem]:

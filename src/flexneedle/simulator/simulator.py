@@ -16,7 +16,7 @@ from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Adaptation, Model, adapt, check_adaptation, insert_essential, pack
 from flexneedle.mechanics.rollout import Models
-from flexneedle.mechanics.zones import NO_ZONES, Zones
+from flexneedle.mechanics.zones import Zones
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.batch import count_cores, run
@@ -39,6 +39,7 @@ from flexneedle.simulator.sequences import (
 )
 from flexneedle.simulator.start import measured_point, measured_slope, straight_needle
 from flexneedle.simulator.state import Solved, State
+from flexneedle.simulator.zones import zones_of
 from flexneedle.types import COLUMNS, Control, Floats
 
 _MECHANICS = ("needle", "setup", "entry", "tissue", "contact")  # the sections that a state depends on
@@ -62,6 +63,8 @@ class Simulator:
     Args:
         scenario: A scenario, its name or its path, as for `load_scenario`.
         threads: Threads of rollouts (default: all cores that the process may use); results do not depend on it.
+        constants: Constants of the needle in its tissue (default: the scenario's).
+        zones: Zones to avoid (default: the scenario's).
 
     Raises:
         ScenarioError: The scenario cannot be used.
@@ -74,13 +77,13 @@ class Simulator:
         threads: int | None = None,
         *,
         constants: Model | None = None,
-        zones: Zones = NO_ZONES,
+        zones: Zones | None = None,
     ) -> None:
         self.scenario = load_scenario(scenario)
         self.threads = count_cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
         self._model = constants or self._nominal
         self._limits = Limits.of(self.scenario)
-        self.zones = zones
+        self.zones = zones_of(self.scenario).packed if zones is None else zones
 
     def __repr__(self) -> str:
         return f"<Simulator of {self.scenario!r}, threads {self.threads}>"

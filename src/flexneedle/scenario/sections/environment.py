@@ -31,6 +31,9 @@ def _a_direction(vector: tuple[float, float, float]) -> tuple[float, float, floa
     return vector
 
 
+Direction = Annotated[Vector, AfterValidator(_a_direction)]
+
+
 class TipSensor(Section):
     """Section `tracker.environment.tip`: the 5-DOF sensor at the tip, one coil."""
 
@@ -67,7 +70,7 @@ class Plate(Section):
 
     distance_mm: Annotated[float, Field(ge=0, le=LARGEST)] = 100.0
     """Distance from the plate to the center of the workspace."""
-    normal: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 0.0, 1.0)
+    normal: Direction = (0.0, 0.0, 1.0)
     """Direction x, y, z from the plate to the workspace, of any length."""
     decay_mm: Positive = 40.0
     """Distance over which the distortion falls to 1/e."""
@@ -96,7 +99,7 @@ class Environment(Section):
     """Correlation length ℓ of the errors: e^(-r²/2ℓ²) at a distance r."""
     shared: Fraction = 0.5
     """Share of the squared error common to all sensors at one position."""
-    generator_mm: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 700.0, 0.0)
+    generator_mm: Direction = (0.0, 700.0, 0.0)
     """Position x, y, z of the field generator, from the center of the workspace."""
     growth: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Exponent of the growth of the error with the distance to the generator; 0: uniform."""

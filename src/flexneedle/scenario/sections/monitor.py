@@ -49,3 +49,6 @@ class GuardSettings(Section):
     """Largest force between guide and needle. Not set: no separate limit."""
     past_target_mm: Positive = 2.0
     """Largest axial distance of the tip past the target."""
+    zone_buffer_mm: NonNegative = 0.5
+    """Least distance of the needle's surface from a zone to avoid, by the estimate. Below it a command may lead away
+    from the zone, but not nearer."""

@@ -1,0 +1,236 @@
+"""The zones of a scenario as arrays of the kernels, with what is added to their margins.
+
+A zone is larger here than in the scenario by what is not known or not computed: twice the standard deviation of the
+image's registration, the error of a grid of distances, and the sag of the path between two contacts. So a clearance is
+a bound. A zone whose margin exceeds the least one is larger by the difference, too: each clearance is compared with the
+least margin.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.files import digest_of
+from flexneedle.geometry.quaternion import to_matrix
+from flexneedle.geometry.rigid import Rigid
+from flexneedle.mechanics import zones as kernels
+from flexneedle.plugins import load_part
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections import zones as sections
+from flexneedle.types import Floats
+
+GROUP = "flexneedle.images"
+"""Entry points of readers of images: `distances` maps a `ZoneFile`, the map of its image to the insertion frame and a
+`Workspace` to a `DistanceGrid`, or None where the zone is out of reach."""
+_SMALL_MM = 1e-4  # for slopes of distances
+_BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
+_BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
+
+
+class Workspace(NamedTuple):
+    """The region of the insertion frame that the needle may reach: its corners (3,), mm.
+
+    far: distance (mm) up to which distances in it are wanted.
+    """
+
+    low: Floats
+    high: Floats
+    far: float
+
+
+class DistanceGrid(NamedTuple):
+    """Distances (a, b, c), mm, from a zone, negative inside, on a grid from its first corner (3,) with a spacing (mm).
+
+    bound: largest distance (mm) by which a value, or an interpolated one, may exceed the true distance at `near` (mm)
+    or more from the zone.
+    """
+
+    values: Floats
+    first: Floats
+    spacing: float
+    bound: float
+
+
+class Nearest(NamedTuple):
+    """Where a needle is nearest to a zone: its name, the clearance (mm), the points (3,) of axis and zone."""
+
+    zone: str
+    clearance: float
+    needle: Floats
+    surface: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class ZoneMap:
+    """Zones of a scenario, z of them.
+
+    Attributes:
+        names: Names of the zones.
+        margin: The least margin (mm).
+        margins: Margin of each zone (z,), mm.
+        added: What is added to each margin (z,), mm.
+        packed: The zones for rollouts, larger by what is added and by the difference of their margins.
+        radius: Radius of the needle (mm).
+    """
+
+    names: tuple[str, ...]
+    margin: float
+    margins: Floats
+    added: Floats
+    packed: kernels.Zones
+    radius: float
+
+    def __bool__(self) -> bool:
+        return bool(self.names)
+
+    def clearances(self, points: Floats) -> Floats:
+        """Return the clearances (z, …), mm, of the needle's surface at points (…, 3) of its axis; they are bounds.
+
+        Points before the skin are clear: infinite.
+        """
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        found = np.empty((len(self.names), len(flat)))
+        kernels.fill_distances(self.packed, flat, found)
+        found += (self.margins - self.margin - self.radius)[:, None]
+        found[:, flat[:, 0] <= 0.0] = np.inf
+        return found.reshape(-1, *points.shape[:-1])
+
+    def nearest(self, points: Floats) -> "Nearest":
+        """Return where points (n, 3) of the needle's axis are nearest to a zone; one point at least is in tissue."""
+        found = self.clearances(points)
+        zone, at = np.unravel_index(int(found.argmin()), found.shape)
+        here = points[at]
+        ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
+        around = np.empty((len(self.names), 6))
+        kernels.fill_distances(self.packed, ends, around)
+        slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
+        clearance = float(found[zone, at])
+        touched = here - (clearance + self.added[zone] + self.radius) * slope
+        return Nearest(self.names[zone], clearance, here, touched)
+
+
+def zones_of(scenario: Scenario) -> ZoneMap:
+    """Return the zones of a scenario. Raises InputError for a file that cannot be used."""
+    if not scenario.zone:
+        return NO_ZONES
+    files = tuple(_stamp(zone) for zone in scenario.zone if isinstance(zone, sections.ZoneFile))
+    workspace, spacing = _workspace(scenario), scenario.contact.spacing_mm
+    return _zones_of(
+        scenario.zone,
+        scenario.zones,
+        scenario.image,
+        scenario.needle.outer_diameter,
+        spacing,
+        workspace,
+        files,
+    )
+
+
+@lru_cache(maxsize=8)
+def _zones_of(
+    zones: tuple[sections.Zone, ...],
+    settings: sections.ZoneSettings,
+    image: sections.ImageSettings,
+    diameter: float,
+    spacing: float,
+    corners: tuple[tuple[float, ...], tuple[float, ...]],
+    _files: tuple[tuple[int, int], ...],
+) -> ZoneMap:
+    """Return the map of zones; corners: of the workspace; _files: time and size of the files, of which it is made."""
+    margins = np.array([settings.margin_mm if zone.margin_mm is None else zone.margin_mm for zone in zones])
+    least, radius = float(margins.min()), 0.5 * diameter
+    always = sections.REGISTRATION_SDS * image.sd_mm + sag(spacing, least + radius)
+    far = float(margins.max()) + always + radius + _BEYOND_MM
+    low, high = map(np.array, corners)
+    workspace = Workspace(low, high, far)
+    made = []
+    for zone, margin in zip(zones, margins, strict=True):
+        made.append(_SHAPES[type(zone)](zone, image, workspace, always + float(margin) - least))
+    packed = kernels.pack([one for one, _ in made], least + radius + _BEYOND_MM)
+    added = np.array([always + bound for _, bound in made])
+    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, radius)
+
+
+def sag(spacing: float, distance: float) -> float:
+    """Return by how much the middle of two points may be nearer to a point at this distance from both (mm)."""
+    half = min(0.5 * spacing, distance)
+    return distance - math.sqrt(distance**2 - half**2)
+
+
+def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
+    """Return time and size of a zone's file. Raises InputError if it cannot be read, or has changed."""
+    path = Path(zone.file)
+    try:
+        found = path.stat()
+        digest = digest_of(path) if zone.sha256 else None
+    except OSError as error:
+        raise InputError(f"zone {zone.name}: {path}: cannot be read: {error.strerror}") from error
+    if digest != zone.sha256:
+        raise InputError(
+            f"zone {zone.name}: {path}: has changed since the scenario was made (sha256 {digest}); "
+            "plan again with the scenario that names it"
+        )
+    return found.st_mtime_ns, found.st_size
+
+
+def _workspace(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the corners of what the needle may reach below the skin."""
+    entry, setup, depth = scenario.entry, scenario.setup, scenario.setup.max_depth
+    steep = abs(entry.slope) + 1e-3 * entry.free_slope_mrad
+    reach = entry.free_radius_mm + steep * depth + setup.max_lateral + _BESIDE_MM
+    low, high = (
+        (x, entry.lateral_mm + side * reach, entry.lateral_z_mm + side * reach)
+        for x, side in ((0.0, -1.0), (depth, 1.0))
+    )
+    return low, high
+
+
+# ---- shapes, larger by `more` (mm); with a bound (mm) of the error of their distances, by which they are larger, too
+
+_Made = tuple[kernels.Zone, float]
+
+
+def _sphere(zone: sections.Sphere, _image: object, _workspace: object, more: float) -> _Made:
+    return kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm + more), 0.0
+
+
+def _capsule(zone: sections.Capsule, _image: object, _workspace: object, more: float) -> _Made:
+    return kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm + more), 0.0
+
+
+def _box(zone: sections.Box, _image: object, _workspace: object, more: float) -> _Made:
+    axes = to_matrix(np.array(zone.rotation)).T
+    return kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes, more), 0.0
+
+
+def _half_space(zone: sections.HalfSpace, _image: object, _workspace: object, more: float) -> _Made:
+    normal = np.array(zone.normal) / np.linalg.norm(zone.normal)
+    return kernels.half_space(np.array(zone.point_mm) + more * normal, normal), 0.0
+
+
+def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Workspace, more: float) -> _Made:
+    reader = load_part("distances", (), GROUP)
+    to_needle = Rigid(to_matrix(np.array(image.rotation)), np.array(image.translation_mm))
+    found: DistanceGrid | None = reader(zone, to_needle, workspace)
+    if found is None:
+        return kernels.half_space((-1e9, 0.0, 0.0), (1.0, 0.0, 0.0)), 0.0
+    values = found.values - (found.bound + more)
+    return kernels.grid(values, found.first, np.full(3, found.spacing)), found.bound
+
+
+_SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
+    sections.Sphere: _sphere,
+    sections.Capsule: _capsule,
+    sections.Box: _box,
+    sections.HalfSpace: _half_space,
+    sections.ZoneFile: _file,
+}
+
+NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, 0.0)
+"""The map of a scenario without zones."""
