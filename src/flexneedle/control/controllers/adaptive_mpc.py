@@ -44,6 +44,7 @@ from flexneedle.results import format_mm
 from flexneedle.scenario.sections.fields import NonNegative, Positive, count
 from flexneedle.scenario.sections.weights import drop_old_keys, with_weights
 from flexneedle.simulator.excess import LoadLimits
+from flexneedle.simulator.zones import zones_of
 from flexneedle.types import STILL, Floats, Laterals, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
@@ -110,6 +111,7 @@ class Memory:
     roll: float  # the needle's angle (rad) before the command
     scale: float  # energy (mJ) of the tissue down to the target displaced by 1 mm
     loads: LoadLimits  # limits of the guard
+    clear: float | None  # margin of the zones to avoid (mm), None without zones
     # derivatives ahead of the tip, and the guide's lever, None before the first decision
     outlook: Outlook | None = None
     lever: Lever | None = None
@@ -120,7 +122,9 @@ def begin(task: Task) -> Memory:
     """Return the memory at the start, with the plan's path."""
     path, scenario = path_of_plan(task.plan), task.scenario
     scale = scenario.energy_scale(task.plan.target[0])
-    return Memory(path, path, task.plan.roll, scale, LoadLimits.of(scenario))
+    zones = zones_of(scenario)
+    clear = zones.margin if zones else None
+    return Memory(path, path, task.plan.roll, scale, LoadLimits.of(scenario), clear)
 
 
 def decide(
@@ -152,7 +156,9 @@ def decide(
     rest, rests = _rest_time(task, memory, fitted, ahead.left)
     why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
-    after = Memory(path, rolled, fitted.state.roll, memory.scale, memory.loads, outlook, lever, rests)
+    after = replace(
+        memory, path=path, rolled=rolled, roll=fitted.state.roll, outlook=outlook, lever=lever, rests=rests
+    )
     doubt = fitted.doubt
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples, doubt), after
 
@@ -264,6 +270,7 @@ def cost_terms(
         reserve = reserve_of_bevel(fitted, ahead, outlook, lever, bend, target, least=least, margin=margin)
     weights["reach"] *= not guided
     weights["reserve"] *= bool(reserve.sds.any())
+    weights["zones"] *= memory.clear is not None
     return ADAPTIVE_MPC.terms(
         settings,
         weights,
@@ -273,6 +280,7 @@ def cost_terms(
         length=uncorrected,
         expected=expected,
         angle=angle,
+        clear=memory.clear or 0.0,
         **reserve._asdict(),
         **memory.loads.values,
     )
