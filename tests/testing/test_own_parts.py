@@ -8,6 +8,7 @@ import pytest
 
 from emulated import emulated
 from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.lab.link.records import NodeLoss
 from flexneedle.lab.page.worker.disturbances import DisturbedPlant, DisturbedTracker
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.galil.motors import factory
@@ -17,7 +18,7 @@ from flexneedle.lab.rig.supervised import SupervisedDriver
 from flexneedle.lab.rig.supervisor.dry import DryRunMotors
 from flexneedle.lab.rig.supervisor.protocol import StepCommand
 from flexneedle.lab.ros import motors as ros_motors
-from flexneedle.lab.ros.records import JointReading, NodeLoss, TipReading
+from flexneedle.lab.ros.records import JointReading, TipReading
 from flexneedle.lab.ros.tracker import RosTracker
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, virtual_rig
