@@ -27,7 +27,7 @@ from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.loop.events import Ended, Gate, PeriodEnded, Planned
 from flexneedle.planning.events import Event
-from flexneedle.results import Period
+from flexneedle.results import Action, Period
 
 POLL_S = 0.01
 """Longest time between two checks for a stop."""
@@ -128,7 +128,8 @@ class LinkBridge(Gate):
         if self._shift is None:  # no rig: the time of the first period is now
             self._shift = self._now() - period.time
         if self._supervisor is None and not self._stopped:
-            self._change_state("inserting")
+            held = period.action is Action.HOLD
+            self._change_state(*(("holding", period.decision) if held else ("inserting",)))
         measured = replace(period.measurement, time=period.measurement.time + self._shift)
         self._node.publish(replace(period, time=period.time + self._shift, measurement=measured))
 
@@ -183,7 +184,7 @@ class LinkBridge(Gate):
         self, state: str, reason: str, *, good: bool | None = None, values: dict[str, str] | None = None
     ) -> None:
         self._state, self._published_at = (state, reason), self._now()
-        self._good = state != "stopped" if good is None else good
+        self._good = state not in _BAD if good is None else good
         self._node.publish(LinkState(self._published_at, state, reason, self._good, values or {}))
 
     def _wait_for(self, key: str, what: str) -> None:

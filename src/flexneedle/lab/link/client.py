@@ -6,9 +6,9 @@ from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import RunError
-from flexneedle.lab.link.records import LinkState, LinkTarget, NodeHeartbeat, NodeLoss
+from flexneedle.lab.link.records import NodeHeartbeat, NodeLoss
 from flexneedle.lab.process import ChildProcess
-from flexneedle.results import Plan
+from flexneedle.results import Period, Plan
 from flexneedle.types import VISIBLE
 
 _START_S, _SILENT_S, _STOP_S = 30.0, 1.0, 2.0
@@ -24,6 +24,9 @@ class LinkClient:
 
     Raises RunError if the node does not start.
     """
+
+    droppable: tuple[type, ...] = (Period,)
+    """Records of which the oldest are dropped if the node does not keep up."""
 
     def __init__(self, module: str, setup: object, name: str) -> None:
         self._process = ChildProcess(module, keep_printed=True)
@@ -44,9 +47,9 @@ class LinkClient:
         self.close()
 
     def publish(self, record: Any) -> None:
-        """Publish a record. If the node does not keep up, the oldest periods and joint targets are dropped."""
+        """Publish a record. If the node does not keep up, the oldest of `droppable` are dropped."""
         light = replace(record, shapes=record.shapes[:0], history=()) if isinstance(record, Plan) else record
-        self._channel.send(light, keep=isinstance(record, Plan | LinkTarget | LinkState))
+        self._channel.send(light, keep=not isinstance(record, self.droppable))
 
     def poll(self) -> list[Any]:
         """Return the records received since the last call, oldest first. No record follows a `NodeLoss`."""

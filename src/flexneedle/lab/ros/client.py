@@ -7,7 +7,8 @@ from typing import Any
 from flexneedle.errors import InputError
 from flexneedle.lab.link.client import LinkClient
 from flexneedle.lab.ros.profile import INSERTION_KEYS, TopicProfile
-from flexneedle.lab.ros.records import NodeSetup, RosHeartbeat
+from flexneedle.lab.ros.records import JointTargets, NodeSetup, RosHeartbeat
+from flexneedle.results import Period
 
 
 def check_installed() -> None:
@@ -30,6 +31,8 @@ class NodeClient(LinkClient):
 
     subscribers, publishers: number of nodes of each topic, by key of `publish` and `subscribe`, at the last `poll`.
     """
+
+    droppable = (Period, JointTargets)
 
     def __init__(self, profile: TopicProfile, *, epoch: float = 0.0) -> None:
         check_installed()
