@@ -8,7 +8,6 @@ messages. It ends when the other end is closed.
 """
 
 import asyncio
-import os
 import signal
 import sys
 from collections.abc import Iterable
@@ -16,7 +15,7 @@ from time import monotonic
 
 from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.igtl.composer import IgtlComposer
-from flexneedle.lab.igtl.endpoint import Endpoint, IgtlClient, IgtlServer
+from flexneedle.lab.igtl.endpoint import describe_failure, make_endpoint
 from flexneedle.lab.igtl.messages import Message
 from flexneedle.lab.igtl.records import InsertionBegin, InsertionResult, NodeSetup, TargetWait
 from flexneedle.lab.igtl.requests import PathRequest, StopRequest, check_entry, read_request, to_needle
@@ -44,8 +43,9 @@ class IgtlNode:
         self._refused, self._refused_at = 0, -BEAT_S
         self._noted: set[tuple[str, str]] = set()
         address = setup.settings.address
-        kind: type[Endpoint] = IgtlClient if address.connects else IgtlServer
-        self.endpoint = kind(self.receive, self._log, address.host, address.port)
+        self.endpoint = make_endpoint(
+            self.receive, self._log, address.host, address.port, connects=address.connects
+        )
         self._ended = asyncio.Event()
 
     async def run(self) -> None:
@@ -173,9 +173,7 @@ async def serve(setup: NodeSetup, channel: MessageChannel) -> int:
     try:
         await node.run()
     except OSError as error:
-        address = setup.settings.address
-        why = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)
-        channel.send(NodeLoss(monotonic(), f"cannot listen on {address.host}, port {address.port}: {why}"))
+        channel.send(NodeLoss(monotonic(), describe_failure(node.endpoint, error)))
         channel.flush(BEAT_S)
         return 1
     return 0

@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from time import monotonic
 from typing import Any, Literal, Self
 
+from flexneedle.lab.link.fields import DeviceAge
 from flexneedle.lab.link.records import LinkRefusal
 from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.lab.ros.client import NodeClient
-from flexneedle.lab.ros.profile import DeviceAge, load_part
+from flexneedle.lab.ros.profile import load_part
 from flexneedle.lab.ros.records import Received, TipReading
 from flexneedle.ports import Clock
 from flexneedle.scenario.sections.fields import Section
