@@ -1,7 +1,9 @@
 """Connection of insertions to OpenIGTLink: sends their geometry and states, and receives stops and targets."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
+from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.lab.igtl.records import InsertionBegin, InsertionResult, NodeSetup, TargetWait
 from flexneedle.lab.igtl.settings import IgtlSettings
 from flexneedle.lab.images.frames import ImageRegistration
@@ -19,7 +21,7 @@ def _ignore(_text: str) -> None:
 
 
 class IgtlBridge(LinkBridge):
-    """The connection of an insertion to OpenIGTLink, as a `LinkBridge`; with `begin`, of further insertions.
+    """The connection of an insertion to OpenIGTLink, as a `LinkBridge`; with `insertion`, of further ones.
 
     Args:
         settings: Address and names.
@@ -51,13 +53,20 @@ class IgtlBridge(LinkBridge):
     def _first_record(self) -> dict[str, str]:
         return {"address": str(self.settings.address)}
 
-    def begin(
+    def __exit__(self, *exception: object) -> None:
+        for error in exception:
+            if isinstance(error, FlexneedleError):
+                self._finish(one_line(error))
+        self.close()
+
+    @contextmanager
+    def insertion(
         self,
         show: Callable[[str], None] = _ignore,
         registration: ImageRegistration | None = None,
         on_stop: Callable[[str], None] = _ignore,
-    ) -> None:
-        """Begin another insertion: earlier stops and targets do not count.
+    ) -> Iterator[None]:
+        """Publish another insertion than the first: earlier stops and targets do not count.
 
         Args:
             show: As for the class.
@@ -68,6 +77,13 @@ class IgtlBridge(LinkBridge):
         self._on_stop, self._over = on_stop, False
         self._node.publish(InsertionBegin(registration))
         self._change_state("idle")
+        try:
+            yield
+        except FlexneedleError as error:
+            self._finish(one_line(error))
+            raise
+        finally:
+            self._announce_end()
 
     def end(self, text: str) -> None:
         """End the insertion with its result in one line; later stops have no effect."""
@@ -93,8 +109,11 @@ class IgtlBridge(LinkBridge):
         super().__call__(event)
 
     def _announce_end(self) -> None:
+        self._finish(f"stopped: {self._stopped}" if self._stopped else "ended without a result")
+
+    def _finish(self, text: str) -> None:
         if not self._over:
-            self.end(f"stopped: {self._stopped}" if self._stopped else "ended without a result")
+            self.end(text)
 
     def _stop(self, who: str) -> None:
         if self._over:

@@ -127,9 +127,9 @@ def make_endpoint(receive: Receive, log: Log, host: str, port: int, *, connects:
     return kind(receive, log, host, port)
 
 
-def describe_failure(endpoint: Endpoint, error: OSError) -> str:
+def describe_failure(host: str, port: int, error: OSError) -> str:
     """Return why a server cannot be opened."""
-    return f"cannot listen on {endpoint.host}, port {endpoint.port}: {_explain(error)}"
+    return f"cannot listen on {host}, port {port}: {_explain(error)}"
 
 
 def _explain(error: OSError) -> str:

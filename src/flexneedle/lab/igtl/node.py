@@ -173,7 +173,7 @@ async def serve(setup: NodeSetup, channel: MessageChannel) -> int:
     try:
         await node.run()
     except OSError as error:
-        channel.send(NodeLoss(monotonic(), describe_failure(node.endpoint, error)))
+        channel.send(NodeLoss(monotonic(), describe_failure(node.endpoint.host, node.endpoint.port, error)))
         channel.flush(BEAT_S)
         return 1
     return 0

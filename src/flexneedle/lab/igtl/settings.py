@@ -1,9 +1,10 @@
 """Settings of the connection of an insertion to OpenIGTLink."""
 
+import socket
 from dataclasses import dataclass
 
 from flexneedle.errors import InputError
-from flexneedle.lab.igtl.endpoint import PORT
+from flexneedle.lab.igtl.endpoint import PORT, describe_failure
 
 _CONNECT = "connect:"
 _RULE = f"must be PORT or HOST:PORT to listen, or {_CONNECT}HOST:PORT to connect, such as {PORT}"
@@ -27,6 +28,15 @@ class IgtlAddress:
         if not (port.isascii() and port.isdecimal() and int(port) < 1 << 16):
             raise InputError(f"{text}: {_RULE}")
         return cls(host.strip("[]") or cls.host, int(port), connects)
+
+    def require_free(self) -> None:
+        """Raise InputError if this program cannot listen there."""
+        if self.connects:
+            return
+        try:
+            socket.create_server((self.host, self.port)).close()
+        except OSError as error:
+            raise InputError(describe_failure(self.host, self.port, error)) from None
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host

@@ -182,7 +182,7 @@ class IgtlTracker:
                 opened.set_result(None)
                 await self._closing.wait()
         except OSError as error:
-            opened.set_exception(RunError(describe_failure(self._endpoint, error)))
+            opened.set_exception(RunError(describe_failure(self._endpoint.host, self.port, error)))
 
     def _receive(self, message: Message, peer: str) -> None:
         connected = self._reader.source in {one.peer for one in self._endpoint.peers}

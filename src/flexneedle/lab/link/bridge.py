@@ -65,7 +65,8 @@ class LinkBridge(Gate):
         show: Callable[[str], None],
     ) -> None:
         self._lock, self._ended = Lock(), threading.Event()
-        self._lost = ""
+        self.lost = ""
+        """Why nothing more is received, "" while the node answers."""
         self._state, self._published_at, self._good = ("idle", ""), -_STATE_S, True
         self._begin(record, show)
         self._opened, epoch = monotonic(), time.time()
@@ -147,8 +148,8 @@ class LinkBridge(Gate):
         while self._target is None:
             time.sleep(CHECK_S)
             self.check()
-            if self._lost:
-                raise RunError(f"no target: {self._lost}")
+            if self.lost:
+                raise RunError(f"no target: {self.lost}")
         self._awaited = ""
         self._change_state("idle")
         return self._target
@@ -216,13 +217,13 @@ class LinkBridge(Gate):
         try:
             self._keep_listening()
         except Exception as error:
-            self._lost = f"the connection to {self.protocol} has failed: {describe_error(error)}"
-            self._stop(self._lost)
+            self.lost = f"the connection to {self.protocol} has failed: {describe_error(error)}"
+            self._stop(self.lost)
             raise
 
     def _keep_listening(self) -> None:
         while not self._ended.is_set():
-            if self._lost:  # a node that hung may still forward a stop
+            if self.lost:  # a node that hung may still forward a stop
                 self._ended.wait(POLL_S)
             else:
                 self._node.wait(POLL_S)
@@ -246,7 +247,7 @@ class LinkBridge(Gate):
             case LinkStop(_, source, reason):
                 self._stop(f"{self.stop_source} {source}" + (f" ({reason})" if reason else ""))
             case NodeLoss(_, reason):
-                self._lost = reason
+                self.lost = reason
                 if self._stops_if_lost:
                     self._stop(reason)
                 else:
