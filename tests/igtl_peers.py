@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pyigtl
 
-from emulated import until
+from emulated import DEADLINE_S, until
 
 DEVICE = "NeedleToTracker"
 
@@ -72,7 +72,7 @@ class PlusServer:
 
 
 class Peer:
-    """A client of pyigtl that keeps every message. Use it by `connected`."""
+    """A client of pyigtl, which reads all our types but POLYDATA, STATUS and TRAJ. Use it by `connected`."""
 
     def __init__(self, port):
         self._client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
@@ -90,6 +90,9 @@ class Peer:
     def send(self, message):
         self._client.send_message(message, wait=False)
 
+    def send_text(self, text):
+        self.send(pyigtl.StringMessage(text, device_name="Text"))
+
     def send_stop(self):
         self.send(pyigtl.StringMessage("STOP", device_name="Command"))
 
@@ -105,14 +108,20 @@ class Peer:
 
 
 @contextmanager
-def connected(port):
-    """A peer that is connected to a port."""
+def connected(port, seconds=DEADLINE_S):
+    """A peer that is connected to a port, once somebody listens there."""
+    until(lambda: _listens(port), seconds)
     peer = Peer(port)
     try:
         until(peer._client.is_connected)
         yield peer
     finally:
         peer.stop()
+
+
+def _listens(port):
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
 
 
 def free_port():

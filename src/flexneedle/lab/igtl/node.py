@@ -80,6 +80,7 @@ class IgtlNode:
         match record:
             case InsertionBegin(registration):
                 self._awaits_target, self.frozen, self._entry = False, "", None
+                self._noted.clear()
                 self._composer.begin()
                 if registration is not None:
                     self._composer.registration = registration

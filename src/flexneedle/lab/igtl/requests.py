@@ -65,7 +65,8 @@ def to_needle(registration: ImageRegistration | None, point: Point) -> Point:
     """Return a point of a peer (mm) in the needle's frame, to 0.1 µm. Raises InputError for one farther than 10 m."""
     given = np.array(point)
     # Numbers have 32 bits: a point in the plane may be off by their rounding.
-    x, y, z = np.round(given if registration is None else registration.apply(given), _DIGITS).tolist()
+    mapped = given if registration is None else registration.apply(given)
+    x, y, z = (np.round(mapped, _DIGITS) + 0.0).tolist()  # −0 becomes 0
     if not hypot(x, y, z) <= FARTHEST_MM:
         raise InputError(f"point {_to_text(point)}: farther than 10 m")
     return x, y, z

@@ -92,4 +92,4 @@ class NodeHeartbeat:
 
 
 Requested = LinkStop | LinkArm | LinkTarget | LinkRefusal | LinkNote | NodeLoss
-"""What a node sends to the insertion."""
+"""Records that a node sends to the insertion."""

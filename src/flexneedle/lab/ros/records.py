@@ -1,4 +1,4 @@
-"""Records that a rig and its ROS node exchange, besides those of `flexneedle.lab.link.records`.
+"""Records that a rig and its ROS node exchange, besides `flexneedle.lab.link.records`.
 
 Lengths are in mm in the frame of the insertion: x along its axis into the tissue, y and z across. Times are in s on
 `time.monotonic()`.

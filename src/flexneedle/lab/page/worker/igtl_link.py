@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 
 from flexneedle.errors import RunError, one_line
 from flexneedle.lab.igtl.bridge import IgtlBridge
@@ -11,8 +10,6 @@ from flexneedle.lab.igtl.settings import IgtlAddress, IgtlSettings
 from flexneedle.lab.link.bridge import LinkBridge
 from flexneedle.lab.page.job_orders import JobChange
 from flexneedle.lab.page.worker.task import WorkerTask
-
-_print = partial(print, file=sys.stderr, flush=True)
 
 
 class IgtlLink:
@@ -58,3 +55,7 @@ class IgtlLink:
         if self._bridge is None and self._settings is not None:
             self._bridge = IgtlBridge(self._settings, _print)
         return self._bridge
+
+
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
