@@ -58,10 +58,15 @@ def listed(bridge):
     return [one["event"] for one in bridge.record["events"]]
 
 
+def await_peer(bridge, peer):
+    """Wait until the node has a message of a peer, so that it gets what follows."""
+    peer.send_text("hello")
+    until(lambda: any("'Text'" in one for one in listed(bridge)))
+
+
 def test_a_peer_receives_an_insertion(port):
     with opened(port, registration=ImageRegistration.of_matrix(MATRIX)) as bridge, connected(port) as peer:
-        peer.send_text("hello")
-        until(lambda: any("'Text'" in one for one in listed(bridge)))  # what follows is for it, too
+        await_peer(bridge, peer)
         bridge(Iterated("manipulation", {}))
         bridge(Planned(PLAN))
         for period in PERIODS:
@@ -134,6 +139,7 @@ def test_a_peer_that_reads_nothing_delays_neither_the_insertion_nor_another_peer
     with opened(port) as bridge, connected(port) as peer, socket.socket() as stalled:
         stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         stalled.connect(("127.0.0.1", port))
+        await_peer(bridge, peer)
         number = 0
         for number in range(200):  # 4 MB, more than all buffers
             bridge(PeriodEnded(replace(PERIODS[0], estimate=Pose(float(number), 0.0, 0.0, 0.0, 0.0))))

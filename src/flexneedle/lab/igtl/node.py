@@ -10,6 +10,7 @@ messages. It ends when the other end is closed.
 import asyncio
 import signal
 import sys
+from collections import deque
 from collections.abc import Iterable
 from time import monotonic
 
@@ -46,16 +47,20 @@ class IgtlNode:
         self.endpoint = make_endpoint(
             self.receive, self._log, address.host, address.port, connects=address.connects
         )
-        self._ended = asyncio.Event()
+        self._records, self._arrived = deque[object](), asyncio.Event()
 
     async def run(self) -> None:
         """Send and receive until the other end of the channel is closed. Raises OSError if the port is taken."""
         async with self.endpoint:
             loop = asyncio.get_running_loop()
-            loop.add_reader(self._channel.fileno(), self._take_records)
+            loop.add_reader(self._channel.fileno(), self._read_records)
             beats = asyncio.create_task(self._beat())
-            await self._ended.wait()
-            loop.remove_reader(self._channel.fileno())
+            while not self._channel.ended or self._records:
+                await self._arrived.wait()
+                self._arrived.clear()
+                while self._records:
+                    self.take(self._records.popleft())
+                    await asyncio.sleep(0)  # peers have their turn
             beats.cancel()
 
     async def _beat(self) -> None:
@@ -67,11 +72,11 @@ class IgtlNode:
             number += 1
             await asyncio.sleep(BEAT_S)
 
-    def _take_records(self) -> None:
-        for record in self._channel.receive():
-            self.take(record)
+    def _read_records(self) -> None:
+        self._records.extend(self._channel.receive())
+        self._arrived.set()
         if self._channel.ended:
-            self._ended.set()
+            asyncio.get_running_loop().remove_reader(self._channel.fileno())
 
     # From the insertion
 

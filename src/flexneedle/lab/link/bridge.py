@@ -66,7 +66,7 @@ class LinkBridge(Gate):
     ) -> None:
         self._lock, self._ended = Lock(), threading.Event()
         self.lost = ""
-        """Why nothing more is received, "" while the node answers."""
+        """Reason why nothing more is received, "" while the node answers."""
         self._state, self._published_at, self._good = ("idle", ""), -_STATE_S, True
         self._begin(record, show)
         self._opened, epoch = monotonic(), time.time()
