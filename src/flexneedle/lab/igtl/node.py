@@ -52,6 +52,8 @@ class IgtlNode:
     async def run(self) -> None:
         """Send and receive until the other end of the channel is closed. Raises OSError if the port is taken."""
         async with self.endpoint:
+            if not self._settings.address.connects:
+                self._log(f"listens on {self.endpoint.host}:{self.endpoint.port}")
             loop = asyncio.get_running_loop()
             loop.add_reader(self._channel.fileno(), self._read_records)
             beats = asyncio.create_task(self._beat())

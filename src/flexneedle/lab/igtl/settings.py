@@ -34,7 +34,8 @@ class IgtlAddress:
         if self.connects:
             return
         try:
-            socket.create_server((self.host, self.port)).close()
+            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+            socket.create_server((self.host, self.port), family=family).close()
         except OSError as error:
             raise InputError(describe_failure(self.host, self.port, error)) from None
 
