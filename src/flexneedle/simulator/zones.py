@@ -104,7 +104,7 @@ class ZoneMap:
         kernels.fill_distances(self.exact, flat, found)
         found -= self.radius
         found[:, flat[:, 0] <= 0.0] = np.inf
-        return found.reshape(-1, *points.shape[:-1])
+        return found.reshape(len(self.names), *points.shape[:-1])
 
     def least_clearances(self, points: Floats) -> Floats:
         """Return the least clearances (…), mm, at points (…, 3) of the needle's axis, as a search compares them."""
@@ -115,7 +115,7 @@ class ZoneMap:
 
     def clearance_of(self, state: State) -> float:
         """Return the least clearance (mm) of a state; infinite before the skin."""
-        return float(self.clearances(state.body).min(initial=np.inf))
+        return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf
 
     def nearest(self, points: Floats) -> "Nearest":
         """Return where points (n, 3) of the needle's axis are nearest to a zone; one point at least is in tissue."""
