@@ -61,10 +61,14 @@ class DistanceGrid(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """Where a needle is nearest to a zone: its name, the clearance (mm), the points (3,) of axis and zone."""
+    """Where a needle is nearest to a zone, or deepest in its margin.
+
+    zone: its name; clearance and margin: mm; needle, surface (3,): points of axis and zone.
+    """
 
     zone: str
     clearance: float
+    margin: float
     needle: Floats
     surface: Floats
 
@@ -118,9 +122,12 @@ class ZoneMap:
         return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf
 
     def nearest(self, points: Floats) -> "Nearest":
-        """Return where points (n, 3) of the needle's axis are nearest to a zone; one point at least is in tissue."""
+        """Return where points (n, 3) of the needle's axis, of which one at least is in tissue, are nearest to a zone.
+
+        Zones are compared by clearance less margin.
+        """
         found = self.clearances(points)
-        zone, at = np.unravel_index(int(found.argmin()), found.shape)
+        zone, at = np.unravel_index(int((found - self.margins[:, None]).argmin()), found.shape)
         here = points[at]
         ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
         around = np.empty((len(self.names), 6))
@@ -128,7 +135,7 @@ class ZoneMap:
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
         clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
-        return Nearest(self.names[zone], clearance, here, touched)
+        return Nearest(self.names[zone], clearance, float(self.margins[zone]), here, touched)
 
 
 def zones_of(scenario: Scenario) -> ZoneMap:
