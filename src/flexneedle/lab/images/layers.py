@@ -54,13 +54,14 @@ def find_layers(
 ) -> Layers:
     """Return the layers on the axis down to a depth `deepest`, gaps down to `depth`, and boundaries within a radius.
 
-    A gap, or a layer thinner than 1 mm, is of the layer above it; groups: segments of each choice. Depths in mm. There
-    is no layer if none of the groups is on the axis.
+    A gap, or a layer thinner than 1 mm, is part of the layer above it; gaps of less than 1 mm are not reported. groups:
+    segments of each choice. Depths in mm. There is no layer if none of the groups is on the axis.
     """
     depths = np.arange(0.5 * _STEP_MM, deepest, _STEP_MM)
     found = sampler.which(groups, rays(np.zeros((1, 2)), depths))[0]
     pieces = [Run(choice, top, end) for choice, top, end in _pieces(found)]
-    gaps = tuple((each.top, min(each.end, depth)) for each in pieces if each.choice < 0 and each.top < depth)
+    open_ones = [(each.top, min(each.end, depth)) for each in pieces if each.choice < 0]
+    gaps = tuple((top, end) for top, end in open_ones if end - top >= _THINNEST_MM)
     layers = [each for each in pieces if each.choice >= 0]
     thin = tuple(each for each in layers if each.end - each.top < _THINNEST_MM and each.top < depth)
     runs = _join([each for each in layers if each.end - each.top >= _THINNEST_MM])

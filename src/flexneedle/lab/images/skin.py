@@ -50,7 +50,7 @@ def fit_skin(
         float(np.mean(~inside.any(axis=1))), float(np.mean(first == 0) if inside[:, 0].any() else 0.0), radius
     )
     met = inside.any(axis=1)
-    plane, left = fit_plane(across[met], depths[first[met]])
+    plane, left = fit_plane(across[met], depths[first[met]] - 0.5 * _STEP_MM)
     tilt = math.atan(math.hypot(plane[1], plane[2]))
     if abs(plane[0]) > _FARTHEST_ENTRY_MM:
         side = "outside of" if plane[0] > 0.0 else "below"
