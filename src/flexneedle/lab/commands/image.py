@@ -1,4 +1,4 @@
-"""`flexneedle image`: scenarios by an image; and the option `--image` of other commands."""
+"""`flexneedle image`: scenarios by an image; the option `--image` of other commands; `export --slicer`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed, load_named
+from flexneedle.cli.export import export
+from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import make_number_type
 from flexneedle.errors import InputError
 
@@ -21,7 +23,7 @@ _edge = make_number_type(float, 0.3, 10.0)
 
 
 def add_parser(commands: Commands) -> None:
-    """Add the command to the parser of `flexneedle`, and `--image` to `plan`, `insert` and `serve`."""
+    """Add the command, `--image` to `plan`, `insert` and `serve`, and `--slicer` to `export`."""
     add_group(
         commands,
         "image",
@@ -40,6 +42,14 @@ def add_parser(commands: Commands) -> None:
             help="path of a case file, instead of SCENARIO: target, entry, layers and zones by a label map and "
             "markups of 3D Slicer",
         )
+    parser = commands.choices["export"]
+    parser.set_defaults(handler=_export)
+    parser.add_argument(
+        "--slicer",
+        type=expand_home,
+        metavar="DIR",
+        help="write entry, target, paths, needle and zones of a run or plan for 3D Slicer, in the frame of its image",
+    )
 
 
 def _add_check(commands: Commands) -> None:
@@ -132,4 +142,32 @@ def _example(args: argparse.Namespace) -> int:
 
     for path in write_example(args.folder, args.seed, tuple(args.spacing)):
         print(path)
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    """Write files for 3D Slicer, or what else is exported."""
+    if args.slicer is None:
+        return export(args)
+    if args.csv is not None or args.readings is not None:
+        raise InputError("--slicer: not with --csv or --readings: export one after the other")
+    from flexneedle.lab.images.slicer_scene import has_image, write_scene
+    from flexneedle.record.folder import read_run
+    from flexneedle.record.loading import load_insertion
+
+    run = read_run(args.run)
+    if not run.plans:
+        raise InputError(f"{args.run}: the run ended before planning finished")
+    if run.kind == "insertion":
+        found, note = load_insertion(args.run)
+        if note:
+            print_note(note)
+        paths = write_scene(found, args.slicer)
+    else:
+        paths = write_scene(run.plans, args.slicer)
+    for path in paths:
+        print(path)
+    print(
+        f"frame: {'image' if has_image(run.scenario) else 'needle, since the run has no image'} (LPS in files)"
+    )
     return 0
