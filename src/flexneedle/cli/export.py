@@ -64,7 +64,7 @@ def export(args: argparse.Namespace) -> int:
     from flexneedle.record.loading import load_insertion
 
     if args.csv is None and args.readings is None:
-        raise InputError("what to export: must be one of --csv, --readings, --slicer")
+        raise InputError("--csv or --readings: one must be given")
     if args.csv is not None:
         write, name, default = write_csv, args.csv, _PERIODS
     else:

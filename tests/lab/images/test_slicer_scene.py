@@ -119,7 +119,8 @@ def test_plans_by_strategy_in_the_frame_of_a_scenario_without_an_image(tmp_path)
     np.testing.assert_allclose(read_transform(paths["needle-to-image.tfm"]), np.eye(4))
 
 
-def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine, empty_figures):
+@pytest.mark.usefixtures("drawing")
+def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine):
     engine()
     status, out, _ = run(capsys, "image", "example", "abdomen", "--spacing", "2", "2", "2")
     assert (status, len(out.splitlines())) == (0, 3)
@@ -144,11 +145,12 @@ def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine, empty_fig
         (("plan", "--image", "case.toml", "--target", "40", "1"), "--target: not with --image"),
         (("plan", "--image", "none.toml"), "none.toml: no such file"),
         (("export", "run", "--slicer", "scene", "--csv"), "--slicer: not with --csv or --readings"),
-        (("export", "run"), "what to export: must be one of --csv, --readings, --slicer"),
+        (("export", "run"), "--csv, --readings or --slicer: one must be given"),
         (("export", "run", "--slicer", "scene"), "run: contains no run"),
     ],
 )
-def test_options_that_contradict_each_other(capsys, in_tmp, words, message):
+@pytest.mark.usefixtures("in_tmp")
+def test_options_that_contradict_each_other(capsys, words, message):
     status, _, err = run(capsys, *words)
     assert status == 2
     assert message in err

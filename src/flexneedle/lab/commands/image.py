@@ -147,6 +147,8 @@ def _example(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     """Write files for 3D Slicer, or what else is exported."""
+    if args.slicer is None and args.csv is None and args.readings is None:
+        raise InputError("--csv, --readings or --slicer: one must be given")
     if args.slicer is None:
         return export(args)
     if args.csv is not None or args.readings is not None:

@@ -26,6 +26,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
 _SMALLEST_MM = 1.0  # distance of target and entry
+_KEYS = "valid keys: "
 _ABOVE_MM = 30.0  # the skin, in which zones are sought
 
 
@@ -231,7 +232,7 @@ def _material(number: int, choice: LayerChoice, base: Scenario) -> dict[str, Any
     start = base.tissue[names.index(found[0])].model_dump(mode="json", exclude_none=True) if found else {}
     replaced = {"thickness_mm", *([SHEAR] if YOUNG in choice.values else [])}
     kept = {name: value for name, value in start.items() if name not in replaced}
-    made = kept | choice.values | {"name": ", ".join(choice.segments)}
+    made = kept | {"name": ", ".join(choice.segments)} | choice.values
     _check_layer(key, made)
     return made
 
@@ -242,7 +243,8 @@ def _check_layer(key: str, values: dict[str, Any]) -> None:
     try:
         Scenario.from_values(minimal)
     except ScenarioError as error:
-        lines = [line.replace("tissue[0]", key) for line in error.problems if line.startswith("tissue[0]")]
+        own = [line for line in error.problems if line.startswith("tissue[0]")]
+        lines = [line.replace("tissue[0]", key).replace(_KEYS, f"{_KEYS}segments, tissue, ") for line in own]
         if lines:
             raise ScenarioError(*lines) from None
 

@@ -38,7 +38,7 @@ def find_surface(field: Floats, first: Floats, spacing: float) -> Mesh | None:
     Naive surface nets (Gibson, MICCAI 1998): one point in each cell that the surface crosses, at the mean of its
     crossings of the cell's edges; it is within √3 spacings of the surface. Values are closed at the grid's faces.
     """
-    closed = np.pad(field, 1, constant_values=_FAR_MM)  # so far that the surface is at the face
+    closed = np.pad(field, 1, constant_values=_FAR_MM)  # the surface is at the face
     below = closed < 0.0
     if not below.any():
         return None
