@@ -166,7 +166,7 @@ def _make_scenario(
 ) -> Scenario:
     """Return the scenario. Raises ScenarioError for what breaks its rules, such as a target out of reach."""
     registration, values = _registration(case, skin), base.values()
-    x, y, z = (round(float(value), 6) for value in target)
+    x, y, z = (round(float(value), 6) + 0.0 for value in target)  # 0, not −0
     entry = {"lateral_mm": 0.0, "lateral_z_mm": 0.0, "slope_mrad": 0.0, "slope_z_mrad": 0.0}
     free = {
         key: value
