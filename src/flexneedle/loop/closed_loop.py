@@ -117,7 +117,8 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         ending = _ending(task, state)
         period = _make_period(index, now, task, rig, step, motion.control, observation, clocks)
         warning = warn_of_miss(step.decision, state.in_a_row) or step.decision.doubt
-        yield replace(period, warning=warning), ending
+        clearance = steering.guard.zones.clearance_of(observation.estimate.state)
+        yield replace(period, warning=warning, clearance=clearance), ending
         if ending is not None:
             return
 

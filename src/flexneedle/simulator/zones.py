@@ -23,6 +23,7 @@ from flexneedle.mechanics import zones as kernels
 from flexneedle.plugins import load_part
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections import zones as sections
+from flexneedle.simulator.state import State
 from flexneedle.types import Floats
 
 GROUP = "flexneedle.images"
@@ -30,6 +31,8 @@ GROUP = "flexneedle.images"
 `Workspace` to a `DistanceGrid`, or None where the zone is out of reach."""
 _SMALL_MM = 1e-4  # for slopes of distances
 _BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
+_ANYWHERE_MM = 1e6
+_NOWHERE_MM = -1e9
 _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
 
 
@@ -77,7 +80,8 @@ class ZoneMap:
         margin: The least margin (mm).
         margins: Margin of each zone (z,), mm.
         added: What is added to each margin (z,), mm.
-        packed: The zones for rollouts, larger by what is added and by the difference of their margins.
+        packed: The zones for searches, larger by what is added and by the difference of their margins.
+        exact: The zones for results, larger by what is added, with distances at any distance.
         radius: Radius of the needle (mm).
     """
 
@@ -86,6 +90,7 @@ class ZoneMap:
     margins: Floats
     added: Floats
     packed: kernels.Zones
+    exact: kernels.Zones
     radius: float
 
     def __bool__(self) -> bool:
@@ -98,10 +103,21 @@ class ZoneMap:
         """
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         found = np.empty((len(self.names), len(flat)))
-        kernels.fill_distances(self.packed, flat, found)
-        found += (self.margins - self.margin - self.radius)[:, None]
+        kernels.fill_distances(self.exact, flat, found)
+        found -= self.radius
         found[:, flat[:, 0] <= 0.0] = np.inf
-        return found.reshape(-1, *points.shape[:-1])
+        return found.reshape(len(self.names), *points.shape[:-1])
+
+    def least_clearances(self, points: Floats) -> Floats:
+        """Return the least clearances (…), mm, at points (…, 3) of the needle's axis, as a search compares them."""
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        found = np.empty(len(flat))
+        kernels.fill_least_distances(self.packed, flat, found)
+        return found.reshape(points.shape[:-1]) - self.radius
+
+    def clearance_of(self, state: State) -> float:
+        """Return the least clearance (mm) of a state; infinite before the skin."""
+        return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf
 
     def nearest(self, points: Floats) -> "Nearest":
         """Return where points (n, 3) of the needle's axis are nearest to a zone; one point at least is in tissue."""
@@ -110,7 +126,7 @@ class ZoneMap:
         here = points[at]
         ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
         around = np.empty((len(self.names), 6))
-        kernels.fill_distances(self.packed, ends, around)
+        kernels.fill_distances(self.exact, ends, around)
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
         clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
@@ -151,12 +167,12 @@ def _zones_of(
     far = float(margins.max()) + always + radius + _BEYOND_MM
     low, high = map(np.array, corners)
     workspace = Workspace(low, high, far, least + radius)
-    made = []
-    for zone, margin in zip(zones, margins, strict=True):
-        made.append(_SHAPES[type(zone)](zone, image, workspace, always + float(margin) - least))
-    packed = kernels.pack([one for one, _ in made], least + radius + _BEYOND_MM)
-    added = np.array([always + bound for _, bound in made])
-    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, radius)
+    made = [_SHAPES[type(zone)](zone, image, workspace) for zone in zones]
+    shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
+    packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
+    rows = kernels.pack(shapes, _ANYWHERE_MM, added).rows
+    exact = kernels.Zones(rows, packed.fields, _ANYWHERE_MM)
+    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, exact, radius)
 
 
 def sag(spacing: float, distance: float) -> float:
@@ -170,7 +186,8 @@ def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
     path = Path(zone.file)
     try:
         found = path.stat()
-        digest = digest_of(path) if zone.sha256 else None
+        stamp = found.st_mtime_ns, found.st_size
+        digest = _digest_of(path, stamp) if zone.sha256 else None
     except OSError as error:
         raise InputError(f"zone {zone.name}: {path}: cannot be read: {error.strerror}") from error
     if digest != zone.sha256:
@@ -178,7 +195,12 @@ def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
             f"zone {zone.name}: {path}: has changed since the scenario was made (sha256 {digest}); "
             "plan again with the scenario that names it"
         )
-    return found.st_mtime_ns, found.st_size
+    return stamp
+
+
+@lru_cache(maxsize=100)
+def _digest_of(path: Path, _stamp: tuple[int, int]) -> str:
+    return digest_of(path)
 
 
 def _workspace(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -193,37 +215,35 @@ def _workspace(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]
     return low, high
 
 
-# ---- shapes, larger by `more` (mm); with a bound (mm) of the error of their distances, by which they are larger, too
+# ---- shapes, each with a bound (mm) of the error of its distances
 
 _Made = tuple[kernels.Zone, float]
 
 
-def _sphere(zone: sections.Sphere, _image: object, _workspace: object, more: float) -> _Made:
-    return kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm + more), 0.0
+def _sphere(zone: sections.Sphere, _image: object, _workspace: object) -> _Made:
+    return kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm), 0.0
 
 
-def _capsule(zone: sections.Capsule, _image: object, _workspace: object, more: float) -> _Made:
-    return kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm + more), 0.0
+def _capsule(zone: sections.Capsule, _image: object, _workspace: object) -> _Made:
+    return kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm), 0.0
 
 
-def _box(zone: sections.Box, _image: object, _workspace: object, more: float) -> _Made:
+def _box(zone: sections.Box, _image: object, _workspace: object) -> _Made:
     axes = to_matrix(np.array(zone.rotation)).T
-    return kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes, more), 0.0
+    return kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes), 0.0
 
 
-def _half_space(zone: sections.HalfSpace, _image: object, _workspace: object, more: float) -> _Made:
-    normal = np.array(zone.normal) / np.linalg.norm(zone.normal)
-    return kernels.half_space(np.array(zone.point_mm) + more * normal, normal), 0.0
+def _half_space(zone: sections.HalfSpace, _image: object, _workspace: object) -> _Made:
+    return kernels.half_space(zone.point_mm, zone.normal), 0.0
 
 
-def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Workspace, more: float) -> _Made:
+def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Workspace) -> _Made:
     reader = load_part("distances", (), GROUP)
     to_needle = Rigid(to_matrix(np.array(image.rotation)), np.array(image.translation_mm))
     found: DistanceGrid | None = reader(zone, to_needle, workspace)
     if found is None:
-        return kernels.half_space((-1e9, 0.0, 0.0), (1.0, 0.0, 0.0)), 0.0
-    values = found.values - (found.bound + more)
-    return kernels.grid(values, found.first, np.full(3, found.spacing)), found.bound
+        return kernels.half_space((_NOWHERE_MM, 0.0, 0.0), (1.0, 0.0, 0.0)), 0.0
+    return kernels.grid(found.values, found.first, np.full(3, found.spacing)), found.bound
 
 
 _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
@@ -234,5 +254,5 @@ _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
     sections.ZoneFile: _file,
 }
 
-NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, 0.0)
+NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, kernels.NO_ZONES, 0.0)
 """The map of a scenario without zones."""

@@ -139,8 +139,8 @@ def _zones(scenario: Scenario) -> Iterator[tuple[str, Mesh]]:
 def _distances(zones: ZoneMap, points: Floats) -> Floats:
     """Return distances (z, n) of points (n, 3) from the zones themselves, without what is added."""
     found = np.empty((len(zones.names), len(points)))
-    fill_distances(zones.packed, np.ascontiguousarray(points), found)
-    distances: Floats = found + (zones.added + zones.margins - zones.margin)[:, None]
+    fill_distances(zones.exact, np.ascontiguousarray(points), found)
+    distances: Floats = found + zones.added[:, None]
     return distances
 
 
