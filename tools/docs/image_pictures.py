@@ -2,8 +2,8 @@
 
     python tools/docs/image_pictures.py [--out docs/images] [--seed N]
 
-Makes the synthetic abdomen of a seed, plans and inserts by its case, and draws sections of the label map in the needle
-frame with zones, margins, the straight line, and both paths.
+Makes the synthetic abdomen of a seed, plans and inserts by its case, and draws two sections of the label map along the
+planned path in the needle frame, with margins of zones, the straight line, and both paths.
 """
 
 import argparse
@@ -39,11 +39,12 @@ _COLOURS = (
 _BESIDE, _DEEPEST = 32.0, 75.0
 
 
-def section(sampler, axis):
-    """Return labels (depths, lateral) of the section through x and one lateral axis."""
+def section(sampler, axis, path):
+    """Return labels and points (depths, lateral) of the section along a path (n, 3), across one lateral axis."""
     depths, lateral = np.arange(-8.0, _DEEPEST, 0.25), np.arange(-_BESIDE, _BESIDE, 0.25)
     points = np.zeros((len(depths), len(lateral), 3))
     points[..., 0], points[..., 1 + axis] = depths[:, None], lateral
+    points[..., 2 - axis] = np.interp(depths, path[:, 0], path[:, 2 - axis])[:, None]
     over = [each for each in SEGMENTS if each.layer == 1]
     under = [each for each in SEGMENTS if each.layer == 0]
     found = sampler.which([[each] for each in (*over, *under)], points)
@@ -54,7 +55,7 @@ def section(sampler, axis):
 def draw(axes, axis, sampler, insertion):
     """Draw one section."""
     plan, scenario = insertion.plan, insertion.scenario
-    labels, points = section(sampler, axis)
+    labels, points = section(sampler, axis, plan.tips)
     extent = (-8.0, _DEEPEST, -_BESIDE, _BESIDE)
     axes.imshow(
         labels.T, origin="lower", extent=extent, cmap=ListedColormap(_COLOURS), vmin=-0.5, vmax=9.5, alpha=0.8
@@ -78,8 +79,11 @@ def draw(axes, axis, sampler, insertion):
     shape = np.asarray(insertion.periods[-1].shape)
     axes.plot(shape[:, 0], shape[:, 1 + axis], "-", color=ESTIMATE, lw=1.8, label="needle at the end")
     axes.plot(*np.array(plan.target)[[0, 1 + axis]], "x", color=TARGET, ms=8, mew=2, label="target")
-    axes.plot([], [], "-", color=TRUE, lw=1.0, label="zones with their margins")
+    axes.plot([], [], "-", color=TRUE, lw=1.0, label="ribs and vessels with their margins")
     axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="depth (mm)", ylabel=f"{'yz'[axis]} (mm)")
+    if axis == 0:
+        for x, name in ((5.0, "fat"), (14.0, "muscle"), (45.0, "liver")):
+            axes.text(x, -26.0, name, rotation=90 if x < 20 else 0, ha="center", va="center", fontsize=8)
 
 
 def main(argv=None):
@@ -99,7 +103,7 @@ def main(argv=None):
         for axis, axes in enumerate(both):
             draw(axes, axis, sampler, insertion)
         figure.legend(
-            *both[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False
+            *both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
         )
         figure.savefig(args.out / "slicer.png", dpi=100)
 

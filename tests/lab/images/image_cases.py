@@ -10,7 +10,7 @@ from flexneedle.lab.images.markups import LINE, POINTS, ControlPoint, Markup, wr
 from flexneedle.lab.images.volumes import write_label_map
 
 ENDS = (6.0, 18.0, 80.0)  # depths at which fat, muscle and liver end
-VESSEL = np.array([30.0, 5.0, 2.0]), 4.0  # centre and radius in the frame of the layers
+VESSEL = np.array([30.0, 9.0, 6.0]), 4.0  # centre and radius in the frame of the layers
 TURN = to_matrix(from_vector(np.array([0.4, -0.3, 0.8])))  # of the layers' frame to RAS
 ORIGIN = np.array([12.0, -34.0, 56.0])
 TEXT = """

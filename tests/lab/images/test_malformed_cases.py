@@ -163,7 +163,7 @@ PLACES = [
     ),
     ({"target": (95.0, 0.0, 0.0)}, "", "target.depth_mm = 9.*: beyond the stroke: must be at most 81.5"),
     (
-        {"target": (30.0, 5.0, 2.0), "axis": ((0, 0, 0), (1, 0, 0))},
+        {"target": (30.0, 9.0, 6.0), "axis": ((0, 0, 0), (1, 0, 0))},
         'direction = "axis"\n',
         "zone = 'vessel': contains the target",
     ),

@@ -1,5 +1,6 @@
 """Files for 3D Slicer of a run: markups, models of needle and zones, and the transform to the image's frame."""
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.zones import ZoneMap, zones_of
 from flexneedle.types import Floats
 
-MARKUPS, NEEDLE, TRANSFORM = "markups.mrk.json", "needle.ply", "needle-to-image.tfm"
+NEEDLE, TRANSFORM = "needle.ply", "needle-to-image.tfm"
 _APART_MM = 1e-3  # of points of a curve
 _BESIDE_MM, _SPACING_MM = 40.0, 1.0  # of the surfaces of zones
 
@@ -41,13 +42,17 @@ def write_scene(run: Insertion | dict[str, Plan], folder: Path) -> list[Path]:
         raise InputError(f"{path}: cannot be created: {error.strerror}") from None
     shape = _shape_of(run, next(iter(plans.values())))
     markups = [*_markups(scenario, run, plans, shape)]
-    write_markups([_map_markup(each, to_image) for each in markups], path / MARKUPS)
+    names = [f"{_plain(each.name)}.mrk.json" for each in markups]
+    for name, markup in zip(
+        names, markups, strict=True
+    ):  # older versions of 3D Slicer read the first one of a file
+        write_markups([_map_markup(markup, to_image)], path / name)
     meshes = {NEEDLE: make_tube(_distinct(shape), 0.5 * scenario.needle.outer_diameter)}
     meshes |= dict(_zones(scenario))
     for name, mesh in meshes.items():
         write_mesh(Mesh(to_image.apply(mesh.points), mesh.triangles), path / name)
     write_transform(matrix(to_image), path / TRANSFORM)
-    return [path / name for name in (MARKUPS, *meshes, TRANSFORM)]
+    return [path / name for name in (*names, *meshes, TRANSFORM)]
 
 
 def image_frame(scenario: Scenario) -> Rigid:
@@ -91,7 +96,7 @@ def _markups(
         true = np.array([each.true_tip[:3] for each in run.periods if each.true_tip is not None])
         if len(true):
             yield _curve("true path", true)
-    yield _curve("needle", shape)
+    yield _curve("needle shape", shape)
 
 
 def _curve(name: str, points: Floats) -> Markup:
@@ -145,4 +150,4 @@ def _distances(zones: ZoneMap, points: Floats) -> Floats:
 
 
 def _plain(name: str) -> str:
-    return "".join(c if c.isalnum() else "-" for c in name).strip("-").lower() or "unnamed"
+    return re.sub(r"[^\w]+", "-", name).strip("-").lower() or "unnamed"

@@ -36,7 +36,8 @@ def find_surface(field: Floats, first: Floats, spacing: float) -> Mesh | None:
     """Return the closed surface around a field's values (a, b, c) below 0 on a grid, None if there are none.
 
     Naive surface nets (Gibson, MICCAI 1998): one point in each cell that the surface crosses, at the mean of its
-    crossings of the cell's edges; it is within √3 spacings of the surface. Values are closed at the grid's faces.
+    crossings of the cell's edges; it is within √3 spacings of the surface, which is closed at the grid's faces. An edge
+    has two triangles, or four where two parts of the surface touch.
     """
     closed = np.pad(field, 1, constant_values=_FAR_MM)  # the surface is at the face
     below = closed < 0.0
