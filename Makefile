@@ -189,6 +189,7 @@ docs: setup  ## build the documentation site into site/; warnings are errors
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/scenario_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/rig_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/recording_reference.py
+	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/case_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/command_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/rig_states.py
 	$(call quick,cd $(OUT) &&) PYTHONPATH=tools/docs $(abspath $(BIN))/zensical build --strict --clean

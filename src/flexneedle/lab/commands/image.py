@@ -110,7 +110,7 @@ def _load(args: argparse.Namespace) -> Scenario:
     if getattr(args, "target", None) is not None:
         raise InputError(f"--target: not with --image, whose case {args.image.name} names the target")
     made = _import(args)
-    _print(made, to_stderr=getattr(args, "json", False))
+    _print(made, to_stderr=getattr(args, "json", True))  # serve prints its address alone
     return made.scenario
 
 
