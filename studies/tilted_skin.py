@@ -106,7 +106,7 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the study and print the table."""
-    args = parse_worlds(__doc__, 40, argv)
+    args = parse_worlds(__doc__, 30, argv)
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
         rows = [row for found in pool.map(insert_world, product(KINDS, args.worlds)) for row in found]
     print(describe(rows))

@@ -12,7 +12,7 @@ from flexneedle.lab.images.sampling import Sampler, disc, fit_plane, rays
 from flexneedle.types import Floats
 
 STEEPEST_TILT_DEG = 20.0
-"""Largest angle between the skin's normal and the insertion: `studies/tilted_skin.py`."""
+"""Largest angle between the skin's normal and the insertion: see docs/how-to/slicer.md (`make tilted-skin`)."""
 _OUTSIDE_MM, _INSIDE_MM, _STEP_MM, _BESIDE_MM = 40.0, 30.0, 0.2, 1.0  # of the rays
 _FARTHEST_ENTRY_MM = 5.0
 _MOST_MISSING = 0.2  # share of the rays
