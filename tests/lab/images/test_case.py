@@ -3,6 +3,8 @@
 import math
 from pathlib import Path
 
+import nibabel
+import nrrd
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -138,7 +140,40 @@ def test_two_points_of_one_name_are_told_apart_by_the_name_of_their_markup(folde
         import_case(folder / "case.toml")
 
 
+def test_a_label_map_of_nifti_is_the_same_case(folder, tmp_path):
+    """Written by nibabel, with the vessel in the one layer and names by labels."""
+    image = label_map()
+    labels = np.where(image.labels[1] > 0, 4, image.labels[0]).astype(np.uint8)
+    nibabel.save(nibabel.Nifti1Image(labels, image.affine), tmp_path / "image.nii.gz")
+    text = TEXT.replace("image.seg.nrrd", "image.nii.gz")
+    for number, name in enumerate(("fat", "muscle", "liver", "vessel"), 1):
+        text = text.replace(f'"{name}"', f'"Segment_{number}"')
+    one = import_case(write_case(tmp_path, text)).scenario
+    other = import_case(write_case(folder)).scenario
+    assert one.target == other.target
+    assert one.image == other.image
+    assert one.layer_tops == other.layer_tops
+    points = np.random.default_rng(0).uniform([5.0, -20.0, -20.0], [60.0, 20.0, 20.0], (500, 3))
+    np.testing.assert_allclose(
+        zones_of(one).clearances(points), zones_of(other).clearances(points), atol=1e-4
+    )
+
+
 # ---- the synthetic abdomen
+
+
+@pytest.mark.filterwarnings("ignore:datetime.datetime.utcnow:DeprecationWarning")
+def test_the_files_of_the_abdomen_by_pynrrd(tmp_path):
+    """Positions of voxels are those of the anatomy: the target is in the middle of its lesion."""
+    labels, points, _ = write_example(tmp_path, 3, (1.0, 1.0, 2.0))
+    values, header = nrrd.read(str(labels))
+    assert header["space"] == "left-posterior-superior"
+    lesion = int(header["Segment7_LabelValue"]), int(header["Segment7_Layer"])
+    assert header["Segment7_Name"] == "lesion 1"
+    index = np.argwhere(values[lesion[1]] == lesion[0])
+    lps = index @ header["space directions"][1:] + header["space origin"]
+    centre = (lps.min(axis=0) + lps.max(axis=0)) / 2.0 * [-1.0, -1.0, 1.0]
+    np.testing.assert_allclose(centre, positions(points)["target 1"], atol=1.1)
 
 
 def positions(path):
