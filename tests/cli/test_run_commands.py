@@ -314,7 +314,6 @@ def test_a_wrong_target_blames_the_order_only_if_a_scenario_follows(target, misp
         ["insert", "--target", "1", "2", "3", "4"],
         ["insert", "--target", "40", "5", "phantom"],
         ["insert", "--strategy", "both"],
-        ["export", "x"],
         ["export", "x", "--csv", "-", "--readings", "-"],
     ],
 )

@@ -60,6 +60,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("X Y", "Z"),
         help="target in mm: depth X, lateral offset Y, in space also Z (default: scenario)",
     )
+    parser.set_defaults(load=load_named, image=None)
     add_seed(parser, "random seed")
     parser.add_argument(
         "--out",
@@ -96,12 +97,18 @@ def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> N
     )
 
 
+def load_named(args: argparse.Namespace) -> Scenario:
+    """Return the scenario of a name or path. An option may set another function as the default of `load`."""
+    from flexneedle.scenario.files import load_scenario
+
+    return load_scenario(args.scenario)
+
+
 def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
     """Return the scenario with the requested target and all controller settings. Raises ScenarioError."""
     from flexneedle.control.controllers import with_controller_defaults
-    from flexneedle.scenario.files import load_scenario
 
-    scenario = with_controller_defaults(load_scenario(args.scenario), *own, source=args.scenario)
+    scenario = with_controller_defaults(args.load(args), *own, source=args.image or args.scenario)
     return scenario if args.target is None else with_target(scenario, args.target)
 
 
@@ -150,7 +157,7 @@ def compile_first(*axes: int, phantoms: bool = True) -> None:
 
 def run_name(args: argparse.Namespace) -> str:
     """Return the scenario name used in the name of the run folder."""
-    return Path(args.scenario).stem
+    return Path(args.image or args.scenario).stem
 
 
 def print_json(values: Mapping[str, Any]) -> None:

@@ -39,12 +39,14 @@ _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond t
 class Workspace(NamedTuple):
     """The region of the insertion frame that the needle may reach: its corners (3,), mm.
 
-    far: distance (mm) up to which distances in it are wanted.
+    far: distance (mm) up to which distances in it are wanted; near: the least distance (mm) of the needle's axis from a
+    zone that is wanted in a plan, from which on distances must not be too large.
     """
 
     low: Floats
     high: Floats
     far: float
+    near: float
 
 
 class DistanceGrid(NamedTuple):
@@ -171,7 +173,7 @@ def _zones_of(
     always = sections.REGISTRATION_SDS * image.sd_mm + sag(spacing, least + radius)
     far = float(margins.max()) + always + radius + _BEYOND_MM
     low, high = map(np.array, corners)
-    workspace = Workspace(low, high, far)
+    workspace = Workspace(low, high, far, least + radius)
     made = [_SHAPES[type(zone)](zone, image, workspace) for zone in zones]
     shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
     packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
