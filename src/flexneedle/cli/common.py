@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from flexneedle.record.folder import Folder
     from flexneedle.results import Plan
     from flexneedle.scenario.model import Scenario
+    from flexneedle.types import Floats
 
 _TABLE_WIDTH = 200  # characters: a line that is wrapped in a table would split numbers
 
@@ -130,6 +132,22 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
         ("chosen entry, lateral", f"{', '.join(f'{value:.2f}' for value in point)} mm"),
         ("  slope of the axis", f"{', '.join(f'{value:.1f}' for value in slope)} mrad"),
     ]
+
+
+def clearance_rows(
+    scenario: Scenario, title: str, clearance: float, shapes: Iterable[Floats]
+) -> dict[str, str]:
+    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle; none without zones."""
+    import numpy as np
+
+    from flexneedle.simulator.zones import zones_of
+
+    if not scenario.zone:
+        return {}
+    if not isfinite(clearance):
+        return {title: "unknown" if isnan(clearance) else "not in the tissue"}
+    near = zones_of(scenario).nearest(np.concatenate([shape[:, :3] for shape in shapes]))
+    return {title: f"{clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}
 
 
 def compile_first(*axes: int, phantoms: bool = True) -> None:

@@ -58,9 +58,10 @@ class DistanceGrid(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """Where a needle is nearest to a zone: its name, the clearance (mm), the points (3,) of axis and zone."""
+    """The nearest zone: its name and margin (mm), clearance (mm), nearest points (3,) of the needle's axis and the zone."""
 
     zone: str
+    margin: float
     clearance: float
     needle: Floats
     surface: Floats
@@ -112,7 +113,7 @@ class ZoneMap:
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
         clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
-        return Nearest(self.names[zone], clearance, here, touched)
+        return Nearest(self.names[zone], float(self.margins[zone]), clearance, here, touched)
 
 
 def zones_of(scenario: Scenario) -> ZoneMap:
