@@ -58,7 +58,7 @@ class DistanceGrid(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """The nearest zone: its name and margin (mm), clearance (mm), nearest points (3,) of the needle's axis and the zone."""
+    """The nearest zone: name, margin and clearance (mm), and the nearest points (3,) of needle's axis and zone."""
 
     zone: str
     margin: float
@@ -95,11 +95,15 @@ class ZoneMap:
 
         Points before the skin are clear: infinite.
         """
+        added = (self.added + self.radius).reshape(-1, *(1 for _ in points.shape[:-1]))
+        return np.where(points[..., 0] <= 0.0, np.inf, self.distances(points) - added)
+
+    def distances(self, points: Floats) -> Floats:
+        """Return the distances (z, …), mm, of points (…, 3) from the zones as in the scenario, negative inside."""
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         found = np.empty((len(self.names), len(flat)))
         kernels.fill_distances(self.packed, flat, found)
-        found += (self.margins - self.margin - self.radius)[:, None]
-        found[:, flat[:, 0] <= 0.0] = np.inf
+        found += (self.margins - self.margin + self.added)[:, None]
         return found.reshape(-1, *points.shape[:-1])
 
     def nearest(self, points: Floats) -> "Nearest":
@@ -121,7 +125,7 @@ def zones_of(scenario: Scenario) -> ZoneMap:
     if not scenario.zone:
         return NO_ZONES
     files = tuple(_stamp(zone) for zone in scenario.zone if isinstance(zone, sections.ZoneFile))
-    workspace, spacing = _workspace(scenario), scenario.contact.spacing_mm
+    workspace, spacing = workspace_corners(scenario), scenario.contact.spacing_mm
     return _zones_of(
         scenario.zone,
         scenario.zones,
@@ -180,7 +184,7 @@ def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def _workspace(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the corners of what the needle may reach below the skin."""
     entry, setup, depth = scenario.entry, scenario.setup, scenario.setup.max_depth
     steep = abs(entry.slope) + 1e-3 * entry.free_slope_mrad
