@@ -58,10 +58,8 @@ def _draw_silhouettes(ax: Axes, zones: ZoneMap, scenario: Scenario, shape: Float
 def _draw_sections(ax: Axes, zones: ZoneMap, shape: Floats, view: View, *, named: bool) -> None:
     raster = _raster(ax, view, _CELLS)
     through = np.interp(raster.right, shape[:, X], shape[:, 3 - sum(view)])
-    kept = zones.margins + zones.added + zones.radius
-    for name, distances, margin in zip(
-        zones.names, zones.distances(_points(raster, view, through)), kept, strict=True
-    ):
+    found = zones.distances(_points(raster, view, through))
+    for name, distances, margin in zip(zones.names, found, zones.kept, strict=True):
         _fill(ax, raster, distances, alpha=0.45, label="zone to avoid")
         _outline(ax, raster, distances, 0.0, "-", "_zone")
         _outline(ax, raster, distances, float(margin), "--", "margin of zones")

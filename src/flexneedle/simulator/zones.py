@@ -90,6 +90,11 @@ class ZoneMap:
     def __bool__(self) -> bool:
         return bool(self.names)
 
+    @property
+    def kept(self) -> Floats:
+        """Distances (z,), mm, from the zones that the axis of the needle keeps with the margins."""
+        return self.margins + self.added + self.radius
+
     def clearances(self, points: Floats) -> Floats:
         """Return the clearances (z, …), mm, of the needle's surface at points (…, 3) of its axis; they are bounds.
 

@@ -20,10 +20,12 @@ from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import TopicProfile, load_profile
 from flexneedle.lab.ros.records import NodeLoss, Received, RosArm, RosRefusal, RosState, RosStop, RosTarget
+from flexneedle.lab.ros.zones import make_clearance, make_zones
 from flexneedle.loop.events import Ended, Gate, PeriodEnded, Planned
 from flexneedle.planning.events import Event
-from flexneedle.results import Period
+from flexneedle.results import Period, Plan
 from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.simulator.zones import NO_ZONES, zones_of
 from flexneedle.types import Point
 
 POLL_S = 0.01
@@ -70,6 +72,7 @@ class Bridge(Gate):
         self._stopped = self._lost = self._awaited = ""
         self._others = 0  # events that other nodes caused
         self._target: Point | None = None
+        self._zones = NO_ZONES
         self._shift: float | None = None  # from the run's time 0 to this object's
         self._state, self._published_at, self._good = ("idle", ""), -_STATE_S, True
         self._opened, epoch = monotonic(), time.time()
@@ -102,6 +105,7 @@ class Bridge(Gate):
                 return
             case Planned(plan):
                 self._node.publish(plan)
+                self._publish_zones(plan)
             case PeriodEnded(period):
                 self._publish_period(period)
             case Ended():
@@ -115,7 +119,15 @@ class Bridge(Gate):
         if self._supervisor is None and not self._stopped:
             self._change_state("inserting")
         measured = replace(period.measurement, time=period.measurement.time + self._shift)
-        self._node.publish(replace(period, time=period.time + self._shift, measurement=measured))
+        shifted = replace(period, time=period.time + self._shift, measurement=measured)
+        self._node.publish(shifted)
+        if (near := make_clearance(self._zones, shifted)) is not None:
+            self._node.publish(near)
+
+    def _publish_zones(self, plan: Plan) -> None:
+        if plan.scenario is not None and plan.scenario.zone:
+            self._zones = zones_of(plan.scenario)
+            self._node.publish(make_zones(plan.scenario))
 
     def check(self) -> None:
         """Print the events since the last call. Raises StoppedError after a stop."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from flexneedle.lab.ros.profile import TopicProfile
-from flexneedle.types import VISIBLE, Point, Quaternion
+from flexneedle.types import VISIBLE, Floats, Point, Quaternion
 
 # Published
 
@@ -38,6 +38,33 @@ class JointTargets:
 
     time: float
     positions: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ZoneSurface:
+    """A zone to avoid, or its margin. corners (3 t, 3): of its t triangles."""
+
+    name: str
+    is_margin: bool
+    corners: Floats
+
+
+@dataclass(frozen=True)
+class RosZones:
+    """The zones of a plan, and their margins."""
+
+    surfaces: tuple[ZoneSurface, ...]
+
+
+@dataclass(frozen=True)
+class RosClearance:
+    """Least clearance of the estimated needle from zones, the name of the zone, and the nearest points of the two."""
+
+    time: float
+    zone: str
+    clearance: float
+    needle: Point
+    surface: Point
 
 
 # Received
@@ -123,5 +150,5 @@ class NodeHeartbeat:
     publishers: Mapping[str, int]
 
 
-Published = RosState | RosTarget | JointTargets
+Published = RosState | RosTarget | JointTargets | RosZones | RosClearance
 Received = RosStop | RosArm | RosTarget | TipReading | JointReading | RosRefusal | NodeLoss
