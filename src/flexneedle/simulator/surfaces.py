@@ -12,6 +12,7 @@ from flexneedle.types import Floats
 
 _SEARCH = 40  # points of the search for a surface, along the longest side of the workspace
 _ACROSS, _ALONG = 24, 64  # cells of a surface across its shortest side; at most along its longest
+_OUTSIDE = 1e9  # mm; a value beyond the corners
 Indices = NDArray[np.int64]
 
 
@@ -25,11 +26,11 @@ class Surface(NamedTuple):
 def zone_surface(zones: ZoneMap, number: int, low: Floats, high: Floats, distance: float = 0.0) -> Surface:
     """Return the surface of a zone, or at a distance (mm) from it, between two corners (3,), mm.
 
-    It is open where it leaves them, and empty where the zone is not between them.
+    It is closed, by these corners where the zone leaves them, and empty where the zone is not between them.
     """
     wide = float((high - low).max()) / _SEARCH
     values, corner = _sample(zones, number, low, high, wide)
-    near = np.argwhere(np.abs(values - distance) <= wide * 3.0**0.5)
+    near = np.argwhere(values - distance <= wide * 3.0**0.5)
     if not len(near):
         return Surface(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
     first = np.maximum(corner + wide * (near.min(axis=0) - 1.0), low)
@@ -39,8 +40,8 @@ def zone_surface(zones: ZoneMap, number: int, low: Floats, high: Floats, distanc
     finest = float(size.max()) / _ALONG
     cell = finest if has_details else max(float(size.min()) / _ACROSS, finest)
     values, corner = _sample(zones, number, first, last, cell)
-    net = surface_net(values - distance)
-    return Surface(corner + cell * net.points, net.triangles)
+    net = surface_net(np.pad(values - distance, 1, constant_values=_OUTSIDE))
+    return Surface(corner + cell * (net.points - 1.0), net.triangles)
 
 
 def _sample(zones: ZoneMap, number: int, low: Floats, high: Floats, spacing: float) -> tuple[Floats, Floats]:
