@@ -90,9 +90,10 @@ def test_a_zone_of_a_file_is_drawn_by_its_grid(tmp_path):
 def test_the_line_of_the_least_clearance_is_the_shortest_to_a_zone():
     scenario = with_zones("phantom", SPHERE)
     ax = Figure().subplots()
-    zones.draw_nearest(ax, scenario, [straight()[:70], straight()], 5.59, SIDE)
+    zones.draw_nearest(ax, scenario, [straight(), straight(z=3.0)], SIDE)
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [[25.0, 0.0], [25.0, 6.0]], atol=1e-3)
-    assert ax.texts[0].get_text() == "5.59 mm"
+    near = 6.0 - zones_of(scenario).radius - zones_of(scenario).added[0]
+    assert ax.texts[0].get_text() == f"{near:.2f} mm"
 
 
 def with_clearance(scenario, insertion):
@@ -101,14 +102,12 @@ def with_clearance(scenario, insertion):
     periods = tuple(
         replace(
             p,
-            clearance=float(found.clearances(p.shape[:, :3]).min()),
-            true_clearance=None
-            if p.true_shape is None
-            else 0.25 + float(found.clearances(p.true_shape).min()),
+            clearance=float(found.least_clearances(p.shape)),
+            true_clearance=None if p.true_shape is None else float(found.least_clearances(p.true_shape)),
         )
         for p in insertion.periods
     )
-    clearance = found.clearances(insertion.plan.shapes[..., :3]).min(axis=(0, 2))
+    clearance = found.least_clearances(insertion.plan.shapes)
     plan = replace(insertion.plan, clearance=clearance, scenario=scenario)
     return replace(insertion, plan=plan, periods=periods, scenario=scenario)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from math import isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -134,20 +133,18 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
-def clearance_rows(
-    scenario: Scenario, title: str, clearance: float, shapes: Iterable[Floats]
-) -> dict[str, str]:
-    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle; none without zones."""
+def clearance_rows(scenario: Scenario, title: str, shapes: Iterable[Floats]) -> dict[str, str]:
+    """Return the row of a table for the least clearance of shapes (n, ≥ 3) of the needle; none without zones."""
     import numpy as np
 
     from flexneedle.simulator.zones import zones_of
 
     if not scenario.zone:
         return {}
-    if not isfinite(clearance):
-        return {title: "unknown" if isnan(clearance) else "not in the tissue"}
-    near = zones_of(scenario).nearest(np.concatenate([shape[:, :3] for shape in shapes]))
-    return {title: f"{clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}
+    near = zones_of(scenario).nearest(np.stack(list(shapes)))
+    if near is None:
+        return {title: "not in the tissue"}
+    return {title: f"{near.clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}
 
 
 def compile_first(*axes: int, phantoms: bool = True) -> None:

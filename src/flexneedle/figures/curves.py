@@ -160,17 +160,16 @@ def true_clearance(insertion: Insertion) -> Floats:
     return np.array(known, dtype=float).reshape(-1, 2)
 
 
-def nearest_shapes(insertion: Insertion) -> tuple[list[Floats], float]:
-    """Return the true shapes of the needle and their least clearance (mm); where unknown, the estimated ones."""
+def known_shapes(insertion: Insertion) -> list[Floats]:
+    """Return the true shapes (n, 3) of the needle; if one is unknown, the estimated ones (n, 5)."""
     true = [period.true_shape for period in insertion.periods if period.true_shape is not None]
-    if len(true) == len(insertion.periods) and not math.isnan(insertion.true_clearance_mm):
-        return true, insertion.true_clearance_mm
-    return [period.shape for period in insertion.periods], insertion.least_clearance_mm
+    complete = len(true) == len(insertion.periods)
+    return true if complete else [period.shape for period in insertion.periods]
 
 
 def last_shape(insertion: Insertion) -> Floats:
     """Return points (n, ≥ 3) of the needle at the end: true, or estimated where the true shape is not known."""
-    return nearest_shapes(insertion)[0][-1]
+    return known_shapes(insertion)[-1]
 
 
 def intermediate_shapes(tips: Floats, shapes: list[Floats], count: int = 4) -> list[Floats]:

@@ -108,15 +108,13 @@ def _name(ax: Axes, raster: _Raster, distances: Floats, margin: float, name: str
         ax.text(*where, name, clip_on=True, zorder=8, **how).set_in_layout(False)
 
 
-def draw_nearest(
-    ax: Axes, scenario: Scenario, shapes: Iterable[Floats], clearance: float, view: View
-) -> None:
-    """Draw a line from shapes (n, ≥ 3) of the needle to the nearest zone, with the clearance (mm)."""
-    if not scenario.zone or not np.isfinite(clearance):
+def draw_nearest(ax: Axes, scenario: Scenario, shapes: Iterable[Floats], view: View) -> None:
+    """Draw a line from shapes (n, ≥ 3) of the needle to the nearest zone, with the clearance."""
+    near = zones_of(scenario).nearest(np.stack(list(shapes)))
+    if near is None:
         return
-    near = zones_of(scenario).nearest(np.concatenate([shape[:, :3] for shape in shapes]))
     ends = np.array([near.needle, near.surface])[:, view]
-    how: dict[str, Any] = {"color": BAD if clearance < near.margin else INK, "zorder": 8}
+    how: dict[str, Any] = {"color": BAD if near.clearance < near.margin else INK, "zorder": 8}
     ax.plot(*ends.T, linewidth=0.9, marker=".", markersize=4, label="least clearance", **how)
     if is_column():
         return
@@ -127,7 +125,7 @@ def draw_nearest(
         "ha": "center",
         "va": "center",
     }
-    text = f"{format_signed(clearance, '.2f')} mm"
+    text = f"{format_signed(near.clearance, '.2f')} mm"
     ax.annotate(text, ends[0], fontsize=small(), **beside, **how).set_in_layout(False)
 
 

@@ -30,6 +30,7 @@ GROUP = "flexneedle.images"
 `Workspace` to a `DistanceGrid`, or None where the zone is out of reach."""
 _SMALL_MM = 1e-4  # for slopes of distances
 _BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
+_WHOLE = 1e-9  # of a part
 _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
 
 
@@ -78,6 +79,7 @@ class ZoneMap:
         added: What is added to each margin (z,), mm.
         packed: The zones for rollouts, larger by what is added and by the difference of their margins.
         radius: Radius of the needle (mm).
+        spacing: Largest distance (mm) between two points of the needle for which clearances are bounds.
     """
 
     names: tuple[str, ...]
@@ -86,6 +88,7 @@ class ZoneMap:
     added: Floats
     packed: kernels.Zones
     radius: float
+    spacing: float
 
     def __bool__(self) -> bool:
         return bool(self.names)
@@ -103,6 +106,19 @@ class ZoneMap:
         added = (self.added + self.radius).reshape(-1, *(1 for _ in points.shape[:-1]))
         return np.where(points[..., 0] <= 0.0, np.inf, self.distances(points) - added)
 
+    def least_clearances(self, shapes: Floats) -> Floats:
+        """Return the least clearance (…), mm, of each shape (…, n, ≥ 3) of the needle; it is a bound."""
+        found: Floats = self.clearances(self._refine(shapes)).min(axis=(0, -1), initial=np.inf)
+        return found
+
+    def _refine(self, shapes: Floats) -> Floats:
+        """Return points (…, m, 3) of shapes (…, n, ≥ 3), as near to each other as the bound on their sag assumes."""
+        nodes = shapes[..., :3]
+        steps = np.diff(nodes, axis=-2)[..., None, :]
+        parts = max(1, math.ceil(np.linalg.norm(steps, axis=-1).max(initial=0.0) / self.spacing - _WHOLE))
+        between = nodes[..., :-1, None, :] + np.arange(parts)[:, None] / parts * steps
+        return np.concatenate([between.reshape(*nodes.shape[:-2], -1, 3), nodes[..., -1:, :]], axis=-2)
+
     def distances(self, points: Floats) -> Floats:
         """Return the distances (z, …), mm, of points (…, 3) from the zones as in the scenario, negative inside."""
         flat = np.ascontiguousarray(points.reshape(-1, 3))
@@ -111,9 +127,12 @@ class ZoneMap:
         found += (self.margins - self.margin + self.added)[:, None]
         return found.reshape(-1, *points.shape[:-1])
 
-    def nearest(self, points: Floats) -> "Nearest":
-        """Return where points (n, 3) of the needle's axis are nearest to a zone; one point at least is in tissue."""
+    def nearest(self, shapes: Floats) -> "Nearest | None":
+        """Return where shapes (…, n, ≥ 3) of the needle are nearest to a zone; None if none is in tissue."""
+        points = self._refine(shapes).reshape(-1, 3)
         found = self.clearances(points)
+        if not np.isfinite(found).any():
+            return None
         zone, at = np.unravel_index(int(found.argmin()), found.shape)
         here = points[at]
         ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
@@ -164,7 +183,7 @@ def _zones_of(
         made.append(_SHAPES[type(zone)](zone, image, workspace, always + float(margin) - least))
     packed = kernels.pack([one for one, _ in made], least + radius + _BEYOND_MM)
     added = np.array([always + bound for _, bound in made])
-    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, radius)
+    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, radius, spacing)
 
 
 def sag(spacing: float, distance: float) -> float:
@@ -242,5 +261,5 @@ _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
     sections.ZoneFile: _file,
 }
 
-NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, 0.0)
+NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, 0.0, 1.0)
 """The map of a scenario without zones."""

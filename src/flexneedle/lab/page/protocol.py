@@ -254,7 +254,7 @@ class ReachMessage(ServerMessage):
 class RowsMessage(ServerMessage):
     """Rows of an insertion's periods from `first` on, in order. of: "live", "first" or "second" recording.
 
-    A row has the keys of `record.fields.page_values`; with zones also `nearest`, a `NearestZone` of the estimated needle.
+    A row has the keys of `record.fields.page_values`; with zones also `nearest`, the estimated needle's `NearestZone`.
     """
 
     by = "of"

@@ -1,7 +1,6 @@
 """Records of zones for the ROS node, made in the process of the insertion: the node loads no model."""
 
 from collections.abc import Iterator
-from math import isfinite
 
 import numpy as np
 
@@ -28,9 +27,9 @@ def _surfaces(scenario: Scenario, zones: ZoneMap) -> Iterator[ZoneSurface]:
 
 def make_clearance(zones: ZoneMap, period: Period) -> RosClearance | None:
     """Return the least clearance of the estimated needle of a period; None before the skin and without zones."""
-    if not zones or not isfinite(zones.clearances(period.shape[:, : Z + 1]).min()):
+    near = zones.nearest(period.shape)
+    if near is None:
         return None
-    near = zones.nearest(period.shape[:, : Z + 1])
     return RosClearance(period.time, near.zone, near.clearance, _point(near.needle), _point(near.surface))
 
 

@@ -41,13 +41,10 @@ def describe_zones(scenario: Scenario, of: Literal["scene", "live", "first", "se
 
 def find_nearest(zones: ZoneMap, shapes: Iterable[Floats]) -> NearestZone | None:
     """Return where shapes (n, ≥ 3) of a needle are nearest to a zone; None before the skin and without zones."""
-    if not zones:
+    near = zones.nearest(np.stack(list(shapes)))
+    if near is None:
         return None
-    near = zones.nearest(np.concatenate([shape[:, :3] for shape in shapes]))
-    if not np.isfinite(near.clearance):
-        return None
-    ends = (tuple(end.round(_DIGITS).tolist()) for end in (near.needle, near.surface))
-    needle, surface = ends
+    needle, surface = (tuple(end.round(_DIGITS).tolist()) for end in (near.needle, near.surface))
     return NearestZone(zone=near.zone, clearance_mm=near.clearance, needle=needle, surface=surface)
 
 

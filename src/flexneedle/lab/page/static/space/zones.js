@@ -5,6 +5,7 @@ import { shownNearest, shownZones, zoneEntries } from "../zones.js";
 import { paint } from "./room.js";
 import { Tube } from "./tube.js";
 
+const ROOM = 0.05; // mm, around the box: a zone may end with it
 const LINE = 0.1; // mm, radius of the line
 
 export class Zones {
@@ -21,7 +22,7 @@ export class Zones {
 
   // Show only what is in a box.
   clip({ left, right, half }) {
-    const within = (x, y, z, constant) => ({ normal: new Vector3(x, y, z), constant });
+    const within = (x, y, z, constant) => ({ normal: new Vector3(x, y, z), constant: constant + ROOM });
     this.#clip = [
       within(1, 0, 0, -left), within(-1, 0, 0, right), within(0, 1, 0, half), within(0, -1, 0, half), within(0, 0, 1, half), within(0, 0, -1, half),
     ];
