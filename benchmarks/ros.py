@@ -21,9 +21,9 @@ import rosbags.typesys.stores.ros2_humble as ros
 from measuring import LOOPBACK, parser_of, quantiles, show
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from flexneedle.lab.link.records import LinkStop
 from flexneedle.lab.ros.client import NodeClient, open_node
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, TopicProfile, load_profile
-from flexneedle.lab.ros.records import RosStop
 from flexneedle.results import Period, Plan
 from flexneedle.types import Shape
 from synthetic import make_periods, make_plan
@@ -104,11 +104,11 @@ def _stops(node: NodeClient, profile: TopicProfile, count: int, pause: float) ->
         node.poll()
         begun = time.monotonic()
         writer.write(ros.std_msgs__msg__Bool(True))
-        stops: list[RosStop] = []
+        stops: list[LinkStop] = []
         due = time.monotonic() + (float(rng.uniform(0.0, pause)) if pause else 0.0)  # ticks fall anywhere
         while not stops:
             time.sleep(max(0.0, due - time.monotonic()))
-            stops = [one for one in node.poll() if isinstance(one, RosStop)]
+            stops = [one for one in node.poll() if isinstance(one, LinkStop)]
             due += pause
         taken.append(time.monotonic() - begun)
         arrived.append(stops[0].time - begun)

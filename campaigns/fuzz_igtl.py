@@ -5,9 +5,10 @@
 Inputs are valid messages of every type and header version with odd numbers and texts, the same with a correct CRC over
 damaged bodies, messages with changed, missing or repeated bytes, and random bytes. The decoder gets them in pieces. It
 must return messages with finite numbers that can be packed, or skip or refuse with a reason in one line, within a
-second, and keep no more than one message. The part `live` sends them to a running server: it must log lines only, close
-the connections of garbage, and serve another client throughout. Each part ends after N inputs (default: a million) or S
-seconds (default: 600). Prints the inputs; at the first failure its seed and input, and exit status 1.
+second, and keep no more than one message; an insertion and a tracker must read or refuse each. The part `live` sends
+them to a running server: it must log lines only, close the connections of garbage, and serve another client throughout.
+Each part ends after N inputs (default: a million) or S seconds (default: 600). Prints the inputs; at the first failure
+its seed and input, and exit status 1.
 """
 
 import asyncio
@@ -18,6 +19,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from random import Random
 from typing import Any
 
@@ -38,6 +40,8 @@ from flexneedle.lab.igtl.messages import (
     TrajectoryMessage,
     TransformMessage,
 )
+from flexneedle.lab.igtl.requests import read_request
+from flexneedle.lab.igtl.tracker import IgtlTrackerSettings, TransformReader
 from fuzzing import ODD, Failure, main, mutate
 
 SLOWEST_S = 1.0
@@ -131,6 +135,16 @@ def problem(one: Received) -> str:
     return ""
 
 
+def use(one: Received) -> None:
+    """Read a message as an insertion does, which may refuse it, and as a tracker of its device does."""
+    if isinstance(one, Query | Skipped):
+        return
+    with suppress(InputError):
+        read_request(one, one.name)
+    settings = IgtlTrackerSettings.model_construct(device=one.name, axis="x", stamps=True)
+    TransformReader(settings).read(one, "peer", 0.0, False)
+
+
 def decoder(random: Random) -> Iterator[str]:
     """Feed streams in pieces, each until it is refused or has 20 messages."""
     outcomes, slowest = Counter[str](), 0.0
@@ -141,6 +155,8 @@ def decoder(random: Random) -> Iterator[str]:
             cut, begun = random.randint(0, len(data)), time.perf_counter()
             try:
                 found = stream.feed(data[:cut]) + stream.feed(data[cut:])
+                for one in found:
+                    use(one)
             except Exception as error:
                 raise Failure(f"{data.hex()}: {error!r}") from error
             slowest = max(slowest, time.perf_counter() - begun)

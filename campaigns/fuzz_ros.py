@@ -24,21 +24,14 @@ import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 
 from flexneedle.errors import DriverError
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.frames import FARTHEST_MM
 from flexneedle.lab.ros.motors import JointLink, RosMotors
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import SUBSCRIBED, load_profile
-from flexneedle.lab.ros.records import (
-    JointReading,
-    Received,
-    RosArm,
-    RosRefusal,
-    RosStop,
-    RosTarget,
-    TipReading,
-)
+from flexneedle.lab.ros.records import JointReading, Received, TipReading
 from flexneedle.lab.ros.tracker import RosTracker
 from flexneedle.record.messages import STORE
 from flexneedle.types import VISIBLE
@@ -149,15 +142,15 @@ def problem(key: str, data: bytes, record: Received | None) -> str:
         case None:
             nothing = key == "stop" and data[HEADER_BYTES : HEADER_BYTES + 1] == FALSE
             return "" if nothing else "no record"
-        case RosArm():
+        case LinkArm():
             fine = key == "arm" and len(data) >= 5 and data[4] == 1
             return "" if fine else "armed"
-        case RosStop(reason=reason):
+        case LinkStop(reason=reason):
             fine = key in ("stop", "arm")
             return "" if fine and reason == " ".join(reason.split()) else f"stop from {key}"
-        case RosRefusal(reason=reason):
+        case LinkRefusal(reason=reason):
             return "" if reason and reason.isprintable() and len(reason) < 300 else f"reason {reason!r}"
-        case RosTarget(point=point):
+        case LinkTarget(point=point):
             return _far([point])
         case TipReading(position=position, orientation=turn, status=status):
             if (position is None) is (status == VISIBLE):
@@ -302,14 +295,14 @@ def live(random: Random) -> Iterator[str]:
 def _requests(node: NodeClient) -> list[Received]:
     """Return what was received. Raises Failure for an arm, which was not sent."""
     requests = node.poll()
-    if any(isinstance(one, RosArm) for one in requests):
+    if any(isinstance(one, LinkArm) for one in requests):
         raise Failure("armed")
     return requests
 
 
 def _stops(writer: Any, node: NodeClient) -> bool:
     writer.write(ros.std_msgs__msg__Bool(True))
-    return any(isinstance(one, RosStop) for one in _requests(node))
+    return any(isinstance(one, LinkStop) for one in _requests(node))
 
 
 def _within(seconds: float, condition: Callable[[], bool]) -> bool:

@@ -97,13 +97,14 @@ def quick_scenario(folder):
 class Started:
     """An insertion in a separate process. `peer` makes its peers."""
 
-    def __init__(self, folder, profile, *options, ros):
+    def __init__(self, folder, profile, *options, ros, on_rig=False):
         self.folder, self.profile, self.notes = folder, profile, folder / "notes"
         self.out = folder / "out"
         command = [sys.executable, "-m", "flexneedle", "insert", str(quick_scenario(folder)), "--force"]
-        if ros is not None:
+        if ros is not None or on_rig:
             rig = folder / "memory.toml"
-            parts = {"driver": {"kind": "ros_rig:motors", "notes": str(self.notes)}, "ros": ros}
+            parts = {"driver": {"kind": "ros_rig:motors", "notes": str(self.notes)}}
+            parts |= {} if ros is None else {"ros": ros}
             rig.write_text(tomli_w.dumps(RIG | parts | {"tracker": {"kind": "ros_rig:Tip"}}))
             command += ["--rig", str(rig)]
         self.process = subprocess.Popen(
@@ -169,9 +170,10 @@ class Started:
 
 
 @contextmanager
-def started(folder, profile, *options, ros=None):
-    """Start an insertion: on the rig in memory with a section `ros`; None: a virtual rig, or the rig of the options."""
-    made = Started(folder, profile, *options, ros=ros)
+def started(folder, profile, *options, ros=None, on_rig=False):
+    """Start an insertion: on the rig in memory with a section `ros`; None: without it `on_rig`, else a
+    virtual rig, or the rig of the options."""
+    made = Started(folder, profile, *options, ros=ros, on_rig=on_rig)
     try:
         yield made
     finally:

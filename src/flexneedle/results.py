@@ -70,6 +70,7 @@ class Plan:
         refusal: Load of needle or tissue, or zone, for which the plan must not be carried out, else "".
         clearance: Least clearance of the inserted needle from the zones to avoid after each step (m + 1,), mm, a bound:
             see `simulator.zones`; infinite before the skin and without zones.
+        intrusion_mm: Largest distance by which it enters the margin of a zone; 0: it keeps all margins.
     """
 
     strategy: str
@@ -93,6 +94,7 @@ class Plan:
     least_stretch: Floats = field(default_factory=lambda: np.full(1, math.nan))
     refusal: str = ""
     clearance: Floats = field(default_factory=lambda: np.full(1, math.inf))
+    intrusion_mm: float = 0.0
 
     @property
     def least_clearance_mm(self) -> float:

@@ -102,12 +102,12 @@ def with_clearance(scenario, insertion):
     periods = tuple(
         replace(
             p,
-            clearance=float(found.least_clearances(p.shape)),
-            true_clearance=None if p.true_shape is None else float(found.least_clearances(p.true_shape)),
+            clearance=float(found.shape_clearances(p.shape)),
+            true_clearance=None if p.true_shape is None else float(found.shape_clearances(p.true_shape)),
         )
         for p in insertion.periods
     )
-    clearance = found.least_clearances(insertion.plan.shapes)
+    clearance = found.shape_clearances(insertion.plan.shapes)
     plan = replace(insertion.plan, clearance=clearance, scenario=scenario)
     return replace(insertion, plan=plan, periods=periods, scenario=scenario)
 

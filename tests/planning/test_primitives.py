@@ -124,12 +124,14 @@ def made_up(n):
     tips = np.zeros((n, 12, 5))
     tips[:, :, X] = np.where(x < 1.0, x, x - 0.5)
     tips[:, -1] = 7.5, 1.5, 0.0, 0.2, 0.0
-    energy, strain, stretch, loads = (
+    energy, strain, stretch, clearance, loads = (
         np.full((n, 12), 0.1),
         np.zeros((n, 12)),
         np.ones((n, 12)),
+        np.full((n, 12), 5.0),
         np.zeros((n, 12, 6)),
     )
+    clearance[:, 6], clearance[:, 7] = -0.5, 1.5
     energy[:, 6], strain[:, 6], stretch[:, 6], loads[:, 6, 4] = 0.8, 0.009, 0.55, 2.4
     deflection = np.tile(np.arange(12.0), (n, 1))
     values = {
@@ -138,6 +140,7 @@ def made_up(n):
         "strain": strain,
         "stretch": stretch,
         "loads": loads,
+        "clearance": clearance,
     }
     return {"tips": tips, "converged": np.ones((n, 12), dtype=bool), **values}
 
@@ -171,11 +174,20 @@ def test_cost_term_by_term_against_a_computation_by_hand():
     }
 
 
+def test_zones_are_charged_by_the_intrusion_into_their_margin():
+    """The needle is 0.5 mm in a zone after one step, and 0.5 mm in its margin of 2 mm after the next."""
+    found = terms(GUIDED, problem=replace(PROBLEM, clear=2.0))
+    assert found.items() >= terms(GUIDED).items()
+    assert found["zones"] == pytest.approx(60.0 * (2.5 + 0.1 * (2.5 + 0.5) / 12 + 1.5 * 0.5))
+    assert found["compression"] == pytest.approx(100.0 * (0.45 - 0.3))
+
+
 def test_each_weight_scales_its_own_term_alone():
-    base = terms(GUIDED)
+    near = replace(PROBLEM, clear=2.0)
+    base = terms(GUIDED, problem=near)
     for weight in PLAN.settings():
         settings = WEIGHTS.model_copy(update={weight.key: 7.0})
-        changed = terms(GUIDED, problem=replace(PROBLEM, settings=settings))
+        changed = terms(GUIDED, problem=replace(near, settings=settings))
         scaled = {"limits", "guide force"} if weight.name == "limits" else {weight.name}
         assert {name for name in base if changed[name] != pytest.approx(base[name])} == scaled
 

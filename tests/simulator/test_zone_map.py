@@ -31,14 +31,14 @@ def test_the_clearance_of_a_shape_is_a_bound_however_far_its_nodes_are_apart():
     dense = bent(0.01)
     true = np.linalg.norm(dense - CENTER, axis=1).min() - RADIUS - ZONES.radius
     for spacing in (0.5, 1.0, 2.5, 5.0):
-        (found,) = ZONES.least_clearances(bent(spacing)[None])
+        (found,) = ZONES.shape_clearances(bent(spacing)[None])
         chord = spacing**2 * 1e-3 / 4.0  # of the arc, whose second derivative is 2e-3/mm
         assert true - ZONES.added[0] - 1e-9 <= found <= true + chord
 
 
 def test_a_stack_of_shapes_has_a_clearance_each_and_is_clear_before_the_skin():
     shapes = np.stack([bent(2.5), bent(2.5) - [110.0, 0.0, 0.0], bent(2.5, lateral=2.0)])
-    found = ZONES.least_clearances(shapes)
+    found = ZONES.shape_clearances(shapes)
     assert found[1] == np.inf
     assert found[2] - found[0] == pytest.approx(2.0, abs=0.05)
     near = ZONES.nearest(shapes)
@@ -50,7 +50,7 @@ def test_a_stack_of_shapes_has_a_clearance_each_and_is_clear_before_the_skin():
     )
     assert ZONES.nearest(shapes[1]) is None
     assert NO_ZONES.nearest(shapes) is None
-    assert NO_ZONES.least_clearances(shapes).tolist() == [np.inf] * 3
+    assert NO_ZONES.shape_clearances(shapes).tolist() == [np.inf] * 3
 
 
 def test_the_nearest_zone_is_named_with_its_own_margin(tmp_path):

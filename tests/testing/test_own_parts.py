@@ -8,6 +8,8 @@ import pytest
 
 from emulated import emulated
 from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.lab.igtl.tracker import make_tracker as make_igtl_tracker
+from flexneedle.lab.link.records import NodeLoss
 from flexneedle.lab.page.worker.disturbances import DisturbedPlant, DisturbedTracker
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.galil.motors import factory
@@ -17,7 +19,7 @@ from flexneedle.lab.rig.supervised import SupervisedDriver
 from flexneedle.lab.rig.supervisor.dry import DryRunMotors
 from flexneedle.lab.rig.supervisor.protocol import StepCommand
 from flexneedle.lab.ros import motors as ros_motors
-from flexneedle.lab.ros.records import JointReading, NodeLoss, TipReading
+from flexneedle.lab.ros.records import JointReading, TipReading
 from flexneedle.lab.ros.tracker import RosTracker
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, virtual_rig
@@ -40,6 +42,8 @@ from flexneedle.testing import (
 from flexneedle.testing.checks import short_scenario
 from flexneedle.types import VISIBLE, Frame, SensorReading
 from galil_peer import CLOSE, peer
+from igtl_peers import DEVICE, PlusServer, transform
+from igtl_peers import pose as sensor_at
 from rooms import ManualClock, environment
 from stages import Bench, Stage
 from stages import rig_file as rig_in_memory
@@ -195,6 +199,24 @@ class TestAurora(TrackerConformance):
 
     def make(self, clock):
         return Aurora(self.port, clock)
+
+
+class TestIgtlTracker(TrackerConformance):
+    """A sensor at rest that a Plus server sends."""
+
+    seconds = 0.5
+
+    @pytest.fixture(autouse=True)
+    def _served(self):
+        with PlusServer(lambda: [transform(sensor_at(1.0, 2.0, 3.0))]) as self.plus:
+            yield
+
+    def make(self, clock):
+        return make_igtl_tracker({"device": DEVICE, "port": self.plus.port, "axis": "z"}, clock)
+
+    def disconnect(self, tracker):
+        del tracker
+        self.plus.messages = list
 
 
 class TestGalil(MotorsConformance):

@@ -36,9 +36,12 @@ Complexes = NDArray[np.complex128]
 _PLAN_PRECISION_MM = 0.1  # miss of a plan above which its square costs more than the miss itself
 ENERGIES = ("end energy", "mean energy", "peak energy")
 """Terms whose weights are per E₁, the energy of all tissue down to the target displaced by 1 mm."""
+ZONES = {"zones", "compression"}
+"""Terms of zones to avoid."""
 SHARE_OF_LIMIT = 0.8
 """Share of a limit of the guard above which a load is charged."""
 _AT_LIMIT = 0.002  # share of a limit
+_COMPRESSION = 0.3  # of tissue, in detours
 
 
 def per_energy(weights: Mapping[str, float], scale: float) -> dict[str, float]:
@@ -157,6 +160,40 @@ def load_excess(trajectories: Trajectories, strain: float, compression: float) -
 def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
     """Return the excess of the guide's force over its limit (N), as `load_excess`."""
     return _excess(np.hypot(trajectories.loads[:, :, 4], trajectories.loads[:, :, 5]) / force)
+
+
+@cost_term(
+    "mm",
+    outputs=("clearance",),
+    plan=Weight(
+        "zones", "zone_weight", "–", 60.0,
+        "Weight of the distance by which the needle enters the margin of a zone to avoid.",
+    ),
+    adaptive_mpc=Weight(
+        "zones", "zone_weight", "–", 60.0,
+        "As `plan.zone_weight`.",
+    ),
+)  # fmt: skip
+def intrusion(trajectories: Trajectories, clear: float) -> Floats:
+    """Return by how much the needle enters zones (mm), whose margin is `clear` (mm).
+
+    It is the largest intrusion (m − c)⁺ of all steps into the margin m at the clearance c, and a tenth of the mean; in
+    a zone, the depth counts again, by half.
+    """
+    inside = np.maximum(clear - trajectories.clearance, 0.0)
+    touched = np.maximum(-trajectories.clearance, 0.0)
+    total: Floats = inside.max(axis=1) + 0.1 * inside.mean(axis=1) + 1.5 * touched.max(axis=1)
+    return total
+
+
+@cost_term("1", outputs=("stretch",), plan=Weight("compression", default=100.0))
+def detour_compression(trajectories: Trajectories) -> Floats:
+    """Return the largest compression of the tissue beyond 0.3, for detours around zones.
+
+    Tissue that the needle pushes aside takes zones in it along; they are taken to be fixed.
+    """
+    excess: Floats = np.maximum(1.0 - trajectories.stretch.min(axis=1) - _COMPRESSION, 0.0)
+    return excess
 
 
 @cost_term(

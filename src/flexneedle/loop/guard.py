@@ -4,6 +4,7 @@ The state after the command is predicted with the model of the estimate. The gua
 controllers, and no option of an insertion switches it off. Limits: section `guard` of the scenario (decision 0021).
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from flexneedle.results import Plan, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.excess import Excess, LoadLimits
 from flexneedle.simulator.state import State
+from flexneedle.simulator.zones import NO_ZONES, ZoneMap, zones_of
 from flexneedle.types import DB_X, Control, X
 
 _SCALE_SDS = 3.0  # of the prior of the scale
@@ -25,7 +27,7 @@ class Guard:
     """Limits of an insertion.
 
     Loads of needle and tissue, distance (mm) of the tip past the target, which is at `depth` (mm), and error of the
-    scale of the needle's advance; jitter (mm) of a reading.
+    scale of the needle's advance; jitter (mm) of a reading; zones, and the least clearance (mm) from them.
     """
 
     loads: LoadLimits
@@ -33,13 +35,16 @@ class Guard:
     depth: float
     scale: float
     jitter: float
+    zones: ZoneMap = NO_ZONES
+    buffer: float = 0.0
 
     @staticmethod
     def of(scenario: Scenario, plan: Plan) -> "Guard":
         """Return the limits of a scenario with the target of a plan."""
         scale = _SCALE_SDS * scenario.control.axial_scale_sd
         past, jitter = scenario.guard.past_target_mm, scenario.tracker.jitter_per_axis
-        return Guard(LoadLimits.of(scenario), past, plan.target[0], scale, jitter)
+        zones, buffer = zones_of(scenario), scenario.guard.zone_buffer_mm
+        return Guard(LoadLimits.of(scenario), past, plan.target[0], scale, jitter, zones, buffer)
 
     def refusal(self, estimate: Estimate, command: Control) -> str:
         """Return the reason to refuse a command, "" for none.
@@ -74,3 +79,13 @@ class Guard:
         yield from self.loads.excesses(state)
         past = float(state.tip[X]) - self.depth
         yield Excess(past - self.past, f"tip {format_mm(past)} past the target > {self.past:g} mm")
+        if self.zones:
+            yield self._intrusion(state)
+
+    def _intrusion(self, state: State) -> Excess:
+        """Return the excess of the least clearance permitted over the clearance."""
+        nearest = self.zones.nearest(state.body)
+        if nearest is None:
+            return Excess(-math.inf, "")
+        text = f"clearance from zone {nearest.zone} {format_mm(nearest.clearance)} < {self.buffer:g} mm"
+        return Excess(self.buffer - nearest.clearance, text, key="zone_buffer_mm")

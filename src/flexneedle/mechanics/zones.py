@@ -20,8 +20,9 @@ Floats = NDArray[np.float64]
 
 CAPSULE, BOX, HALF_SPACE, GRID = range(4)
 """Shapes of a zone."""
-SHAPE, LOW, HIGH, FIRST = 0, 1, 2, 3
-"""Columns of a zone: shape; x (mm) from which and up to which nodes can be near it; first of its numbers.
+SHAPE, LOW, HIGH, MORE, FIRST = 0, 1, 2, 3, 4
+"""Columns of a zone: shape; x (mm) from which and up to which nodes can be near it; distance (mm) by which it is larger
+than its shape; first of its numbers.
 
 Numbers of a capsule: an end (3), the vector (3) to the other and 1/length² (0 for a sphere), radius. Of a box: centre
 (3), half sizes (3), unit vectors of its axes (9), radius of its edges. Of a half-space: unit vector (3) out of it, and
@@ -90,12 +91,12 @@ def _from_grid(row: Floats, fields: Floats, x: float, y: float, z: float) -> flo
 def distance_from(row: Floats, fields: Floats, x: float, y: float, z: float) -> float:
     """Return the distances (mm) of points from a zone."""
     if row[SHAPE] == CAPSULE:
-        return _from_capsule(row, x, y, z)
+        return _from_capsule(row, x, y, z) - row[MORE]
     if row[SHAPE] == BOX:
-        return _from_box(row, x, y, z)
+        return _from_box(row, x, y, z) - row[MORE]
     if row[SHAPE] == HALF_SPACE:
-        return _from_half_space(row, x, y, z)
-    return _from_grid(row, fields, x, y, z)
+        return _from_half_space(row, x, y, z) - row[MORE]
+    return _from_grid(row, fields, x, y, z) - row[MORE]
 
 
 @inner
@@ -125,6 +126,18 @@ def fill_distances(zones: Zones, points: Floats, distances: Floats) -> None:
             distances[k, i] = distance_from(
                 zones.rows[k], zones.fields, points[i, 0], points[i, 1], points[i, 2]
             )
+
+
+@kernel
+def fill_least_distances(zones: Zones, points: Floats, distances: Floats) -> None:
+    """Set the least distances (n,), mm, of points (n, 3) from all zones; ≤ far."""
+    for i in range(points.shape[0]):
+        distances[i] = zones.far
+        for k in range(zones.rows.shape[0]):
+            row = zones.rows[k]
+            if row[LOW] < points[i, 0] < row[HIGH]:
+                here = distance_from(row, zones.fields, points[i, 0], points[i, 1], points[i, 2])
+                distances[i] = min(distances[i], here)
 
 
 # ---- making zones
@@ -182,13 +195,15 @@ def grid(values: ArrayLike, first: ArrayLike, spacing: ArrayLike) -> Zone:
     return _zone(GRID, (corner, 1.0 / step, cells, 0.0), extent, np.stack(corners, -1).reshape(-1, 8))
 
 
-def pack(zones: Sequence[Zone], far: float) -> Zones:
-    """Return zones as arrays, for distances that are exact up to `far` (mm)."""
+def pack(zones: Sequence[Zone], far: float, more: ArrayLike = 0.0) -> Zones:
+    """Return zones as arrays, larger than their shapes by `more` (mm), for distances that are exact up to `far`."""
     rows = np.array([zone.row for zone in zones]).reshape(-1, COLUMNS)
+    rows[:, MORE] = more
     for row, zone, first in zip(
         rows, zones, np.cumsum([0, *(len(each.field) for each in zones)]), strict=False
     ):
-        row[LOW], row[HIGH] = zone.extent[0] - far, zone.extent[1] + far
+        near = far + row[MORE]
+        row[LOW], row[HIGH] = zone.extent[0] - near, zone.extent[1] + near
         if row[SHAPE] == GRID:
             row[FIRST + 9] = first
     return Zones(rows, np.concatenate([np.empty((0, 8)), *(zone.field for zone in zones)]), far)

@@ -70,6 +70,7 @@ def find_best(
     *,
     first: Floats | None = None,
     progress: OnIteration = lambda _info: None,
+    begun: ce.SearchState | None = None,
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
@@ -82,9 +83,10 @@ def find_best(
         first: Samples (n, d) of the first iteration in place of the Gaussian's, at least as many as the elite. The best
             sample is kept: the result is never worse than an incumbent among them.
         progress: Called after each iteration (default: nothing).
+        begun: State of a search that continues (default: a new one).
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
-    search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
+    search_state = begun or ce.start(variables.mean, variables.sigma, variables.correlation)
 
     latest: list[Samples] = []
     best_cost, best = np.inf, None

@@ -4,7 +4,9 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories, o
 from flexneedle.errors import InputError
 from flexneedle.planning import STRATEGIES
 from flexneedle.planning.cross_entropy import Search, elite_count
+from flexneedle.planning.detours import search_detours
 from flexneedle.planning.entry import mounted_axes, with_entry
 from flexneedle.planning.events import Iterated, Listener, send_event
 from flexneedle.planning.horizon import OnIteration, count_iterations
@@ -21,12 +24,16 @@ from flexneedle.planning.limit import find_largest_load, find_limit
 from flexneedle.planning.primitives import Solution, fix_guide, search_primitives, widen_search
 from flexneedle.planning.problem import PlanProblem, make_problem
 from flexneedle.planning.steering import MOST_ROLLS, reach, search_rolls
+from flexneedle.planning.ways import Room
 from flexneedle.results import TARGET_RADIUS_MM, Plan, format_mm
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import controls
+from flexneedle.simulator.excess import LoadLimits
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.simulator.zones import ZoneMap, zones_of
 from flexneedle.types import DB_X, DG_Y, DG_Z, Floats, Point, X, Z
 
 _TARGET = "depth and lateral offsets in mm"
@@ -35,6 +42,8 @@ _PRECISE_MM = 0.1  # miss of a plan above which other searches are made
 # plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
+_RESERVE_MM = 0.1  # of clearance in a search, beyond the margin
+_OUTPUTS = ("energy", "stretch", "strain", "loads", "shapes", "clearance")
 _ENOUGH_ROLLS = 1  # to reach a target, though not at the least cost
 
 
@@ -87,7 +96,47 @@ def search_plan(simulator: Simulator, goal: Point, strategy: str, seed: int, pro
         after = count_iterations(progress, found.iterations, usual, found.cost)
         again = _search(simulator, change(problem), rng, after)
         found = _choose_better(found, _carry_out(simulator, problem, strategy, seed, again))
-    return found
+    zones = zones_of(scenario)
+    if not found.intrusion_mm:
+        return found
+    return _avoid(simulator, problem, zones, found, rng, progress)
+
+
+def _avoid(
+    simulator: Simulator,
+    problem: PlanProblem,
+    zones: ZoneMap,
+    found: Plan,
+    rng: np.random.Generator,
+    progress: OnIteration,
+) -> Plan:
+    """Return the first plan that keeps the margins and reaches the target; of others, the best."""
+    plan, needle = simulator.scenario.plan, simulator.scenario.needle
+    around = replace(problem, clear=zones.margin + _RESERVE_MM, length=needle.length_mm)
+    after = count_iterations(progress, found.iterations, found.iterations + plan.iterations, np.inf)
+    solutions = search_detours(
+        _make_rollout(simulator, around.terms),
+        _make_rollout(simulator, (), at_end=("shapes",)),
+        around,
+        _make_room(simulator.scenario, zones),
+        _search_settings(plan, plan.samples),
+        rng,
+        after,
+    )
+    best, history = found, found.history
+    for solution in solutions:
+        new = _carry_out(simulator, problem, found.strategy, found.seed, solution)
+        history = (*history, *new.history)
+        best = min(best, new, key=_rank)
+        if best.hit and not best.intrusion_mm and best.error_mm <= _PRECISE_MM:
+            break
+    return replace(best, history=history, iterations=len(history))
+
+
+def _rank(plan: Plan) -> tuple[float, float]:
+    """Return the order of plans: by the intrusion into margins (mm) and the miss beyond what is precise, then cost."""
+    off = plan.intrusion_mm + max(0.0, plan.error_mm - _PRECISE_MM)
+    return (off + (10.0 if plan.refusal else 0.0), plan.cost)
 
 
 def _other_searches(problem: PlanProblem) -> tuple[Callable[[PlanProblem], PlanProblem], ...]:
@@ -184,7 +233,7 @@ def _carry_out(
     goal = problem.target
     rows = _end_at_depth(simulator, solution.controls, solution.roll, goal[0])
     start = simulator.start(solution.roll)
-    steps = simulator.rollout(start, rows[None], outputs=("energy", "stretch", "strain", "loads", "shapes"))
+    steps = simulator.rollout(start, rows[None], outputs=_OUTPUTS)
     load, end = find_largest_load(problem.loads, simulator, start, steps), steps.tips[0, -1]
     return Plan(
         strategy=strategy,
@@ -207,7 +256,24 @@ def _carry_out(
         refusal=load.text if load.share > 1.0 else "",
         least_stretch=np.append(start.least_stretch, steps.stretch[0]),
         scenario=simulator.scenario,
+        **_measure_clearance(simulator, start, rows, steps),
     )
+
+
+def _measure_clearance(
+    simulator: Simulator, start: State, rows: Floats, steps: Trajectories
+) -> dict[str, Any]:
+    """Return clearance and intrusion of a plan from its controls (m, 9) and their rollout (N = 1)."""
+    zones = zones_of(simulator.scenario)
+    clearance = np.full(len(rows) + 1, np.inf)
+    if zones:
+        clearance[1:] = (
+            simulator.with_zones(zones.exact).rollout(start, rows[None], outputs="clearance").clearance
+        )
+        # Before the skin, and beyond `far`, it is a large number.
+        clearance[clearance > zones.exact.far - 2.0 * zones.radius] = np.inf
+    intrusion = zones.margin - steps.clearance.min(initial=np.inf)
+    return {"clearance": clearance, "intrusion_mm": max(0.0, float(intrusion))}
 
 
 def _fix_entry(
@@ -244,14 +310,30 @@ def _search(
     return search_primitives(rollout, problem, _search_settings(plan, plan.samples), rng, progress)
 
 
-def _make_rollout(simulator: Simulator, terms: Sequence[Term]) -> RolloutFunction:
+def _make_room(scenario: Scenario, zones: ZoneMap) -> Room:
+    """Return what first paths are judged by."""
+    curvature = 2.0 * LoadLimits.of(scenario).strain / scenario.needle.outer_diameter
+    return Room(zones.least_clearances, partial(_compression_lengths, scenario), curvature)
+
+
+def _compression_lengths(scenario: Scenario, depths: Floats) -> Floats:
+    """Return the compression lengths (p,), mm, of the layers at depths (p,)."""
+    layer = np.searchsorted(scenario.layer_tops, depths, side="right") - 1
+    lengths: Floats = np.array([each.compression_length_mm for each in scenario.tissue])[layer]
+    return lengths
+
+
+def _make_rollout(
+    simulator: Simulator, terms: Sequence[Term], at_end: tuple[str, ...] = ()
+) -> RolloutFunction:
     start, free, wanted = simulator.start(), simulator.scenario.entry.free, outputs_of(terms)
+    last = (*wanted.at_end, *at_end)
 
     def rollout(controls: Floats) -> Trajectories:
         # Base and guide are mounted at a free entry by the first control, which no limit applies to.
         axes = mounted_axes(simulator.scenario, controls[:, 0]) if free else None
         return simulator.rollout(
-            start, controls, outputs=wanted.outputs, at_end=wanted.at_end, limits=not free, axes=axes
+            start, controls, outputs=wanted.outputs, at_end=last, limits=not free, axes=axes
         )
 
     return rollout

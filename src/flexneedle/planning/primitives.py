@@ -50,7 +50,7 @@ def search_primitives(
 
     `rollout` starts without roll in air; a sample with another direction rolls in its first step, which is not charged.
     """
-    found = find_best(_variables(problem), rollout, problem.terms, search, rng, progress=progress)
+    found = find_best(variables_of(problem), rollout, problem.terms, search, rng, progress=progress)
     return make_solution(problem, found)
 
 
@@ -88,7 +88,8 @@ def make_solution(problem: PlanProblem, found: Found) -> Solution:
     return Solution(controls, place, float(facing[0]), found.cost, found.terms, found.search_state)
 
 
-def _variables(problem: PlanProblem) -> Variables:
+def variables_of(problem: PlanProblem) -> Variables:
+    """Return the variables of a search for primitives, and for the entry if it is free."""
     n, lateral = problem.primitives, problem.step[list(MOVES[problem.axes])]
     most, entry = [*lateral, *[_BEVEL_BOUND] * problem.axes, _SHARE_BOUND], entry_bounds(problem)
     return Variables(
@@ -125,7 +126,7 @@ def make_controls(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     known = problem.primitives * problem.coordinates
     entry, primitives = z[:, known:], z[:, :known].reshape(len(z), problem.primitives, problem.coordinates)
     share = np.exp(primitives[:, :, -1])
-    share *= problem.travel / share.sum(axis=1, keepdims=True)
+    share *= _travel(problem, entry)[:, None] / share.sum(axis=1, keepdims=True)
     count = np.ceil(share / primitives[:, :, ADVANCE] - 1e-9).astype(int)  # steps of each primitive
     steps = np.concatenate([(share / count)[:, :, None], _limit_reach(problem, primitives, count)], axis=2)
     wanted = _directions(problem, primitives[:, :, problem.bevel])
@@ -142,6 +143,17 @@ def make_controls(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     rolls = np.diff(_unwrap_in_range(wanted, problem.rotation), axis=1, prepend=0.0)
     controls[rows, first, ROLL] = rolls if np.isfinite(problem.rotation) else wrap_angles(rolls)
     return mount_needle(problem, controls, entry), wanted
+
+
+def _travel(problem: PlanProblem, entry: Floats) -> Floats:
+    """Return the travel (N,), mm, to the target's depth from entries (N, e): longer for an inclined needle."""
+    if not problem.length or not problem.entry_coordinates:
+        return np.full(len(entry), problem.travel)
+    slopes = np.abs(problem.slope + read_entry(problem, entry)[1])
+    cosine = 1.0 / np.sqrt(1.0 + slopes**2)
+    straight = problem.travel + problem.length * (1.0 - cosine)
+    travel: Floats = np.minimum(straight, problem.reach[0])
+    return travel
 
 
 def drop_small_rolls(wanted: Floats) -> Floats:

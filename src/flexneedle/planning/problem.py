@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.costs.terms import PLAN, per_energy
+from flexneedle.costs.terms import PLAN, ZONES, per_energy
 from flexneedle.costs.weighted_sum import Term
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
@@ -50,6 +50,10 @@ class PlanProblem:
     left: complex = 0.0  # vector y + iz from the nearest axis that is permitted to the target
     energy_scale: float = 0.0  # E₁ (mJ), of all tissue down to the target displaced by 1 mm
     loads: LoadLimits = NO_LIMITS  # limits of the guard
+    # clearance (mm) from zones below which they are charged, and the compression of the tissue, too; None: neither
+    clear: float | None = None
+    # length of the needle (mm), whose slope shortens it along x; 0: neglected
+    length: float = 0.0
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -59,8 +63,12 @@ class PlanProblem:
         weights["deflection"] /= depth
         weights["guide"] *= depth
         weights["guide force"] = weights["limits"]
-        terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **loads.values)
-        return tuple(term for term in terms if term.name != "guide force" or np.isfinite(loads.force))
+        values = {**loads.values, "clear": 0.0 if self.clear is None else self.clear}
+        terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **values)
+        without = {"guide force"} if np.isinf(loads.force) else set()
+        if self.clear is None:
+            without |= ZONES
+        return tuple(term for term in terms if term.name not in without)
 
     @property
     def entry_coordinates(self) -> int:

@@ -195,6 +195,12 @@ class Simulator:
         vars(other).pop("_packed", None)
         return other
 
+    def with_zones(self, zones: Zones) -> "Simulator":
+        """Return this simulator with other zones to avoid."""
+        other = copy(self)
+        other.zones = zones
+        return other
+
     def check(self, state: State, control: Control) -> None:
         """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""
         self._check_mechanics(state)

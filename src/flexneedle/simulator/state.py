@@ -157,6 +157,13 @@ class State:
         curve = np.concatenate([x[:, None], nd.to_parts(y, across), nd.to_parts(slope, across)], axis=1)
         return _freeze(sample_shapes(curve, self.scenario.needle.nodes))
 
+    @property
+    def body(self) -> Floats:
+        """Points (k, 3) of the inserted needle's axis, at the contacts and the tip, mm; none before the skin."""
+        x, y, _ = self._curve()
+        points: Floats = np.stack([x, y.real, y.imag], axis=1)[1:]
+        return points[points[:, 0] > 0.0]
+
     @cached_property
     def contacts(self) -> Contacts:
         """The cut channel."""

@@ -23,6 +23,7 @@ from flexneedle.mechanics import zones as kernels
 from flexneedle.plugins import load_part
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections import zones as sections
+from flexneedle.simulator.state import State
 from flexneedle.types import Floats
 
 GROUP = "flexneedle.images"
@@ -30,7 +31,9 @@ GROUP = "flexneedle.images"
 `Workspace` to a `DistanceGrid`, or None where the zone is out of reach."""
 _SMALL_MM = 1e-4  # for slopes of distances
 _BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
-_WHOLE = 1e-9  # of a part
+_STEEP = 0.05  # by which the distance of two contacts may exceed their spacing
+_ANYWHERE_MM = 1e6
+_NOWHERE_MM = -1e9
 _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
 
 
@@ -77,7 +80,8 @@ class ZoneMap:
         margin: The least margin (mm).
         margins: Margin of each zone (z,), mm.
         added: What is added to each margin (z,), mm.
-        packed: The zones for rollouts, larger by what is added and by the difference of their margins.
+        packed: The zones for searches, larger by what is added and by the difference of their margins.
+        exact: The zones for results, larger by what is added, with distances at any distance.
         radius: Radius of the needle (mm).
         spacing: Largest distance (mm) between two points of the needle for which clearances are bounds.
     """
@@ -87,6 +91,7 @@ class ZoneMap:
     margins: Floats
     added: Floats
     packed: kernels.Zones
+    exact: kernels.Zones
     radius: float
     spacing: float
 
@@ -103,10 +108,9 @@ class ZoneMap:
 
         Points before the skin are clear: infinite.
         """
-        added = (self.added + self.radius).reshape(-1, *(1 for _ in points.shape[:-1]))
-        return np.where(points[..., 0] <= 0.0, np.inf, self.distances(points) - added)
+        return np.where(points[..., 0] <= 0.0, np.inf, self._bounds(points) - self.radius)
 
-    def least_clearances(self, shapes: Floats) -> Floats:
+    def shape_clearances(self, shapes: Floats) -> Floats:
         """Return the least clearance (…), mm, of each shape (…, n, ≥ 3) of the needle; it is a bound."""
         found: Floats = self.clearances(self._refine(shapes)).min(axis=(0, -1), initial=np.inf)
         return found
@@ -115,17 +119,30 @@ class ZoneMap:
         """Return points (…, m, 3) of shapes (…, n, ≥ 3), as near to each other as the bound on their sag assumes."""
         nodes = shapes[..., :3]
         steps = np.diff(nodes, axis=-2)[..., None, :]
-        parts = max(1, math.ceil(np.linalg.norm(steps, axis=-1).max(initial=0.0) / self.spacing - _WHOLE))
+        parts = max(1, math.ceil(np.linalg.norm(steps, axis=-1).max(initial=0.0) / self.spacing - _STEEP))
         between = nodes[..., :-1, None, :] + np.arange(parts)[:, None] / parts * steps
         return np.concatenate([between.reshape(*nodes.shape[:-2], -1, 3), nodes[..., -1:, :]], axis=-2)
 
     def distances(self, points: Floats) -> Floats:
         """Return the distances (z, …), mm, of points (…, 3) from the zones as in the scenario, negative inside."""
+        return self._bounds(points) + self.added.reshape(-1, *(1 for _ in points.shape[:-1]))
+
+    def _bounds(self, points: Floats) -> Floats:
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         found = np.empty((len(self.names), len(flat)))
-        kernels.fill_distances(self.packed, flat, found)
-        found += (self.margins - self.margin + self.added)[:, None]
-        return found.reshape(-1, *points.shape[:-1])
+        kernels.fill_distances(self.exact, flat, found)
+        return found.reshape(len(self.names), *points.shape[:-1])
+
+    def least_clearances(self, points: Floats) -> Floats:
+        """Return the least clearances (…), mm, at points (…, 3) of the needle's axis, as a search compares them."""
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        found = np.empty(len(flat))
+        kernels.fill_least_distances(self.packed, flat, found)
+        return found.reshape(points.shape[:-1]) - self.radius
+
+    def clearance_of(self, state: State) -> float:
+        """Return the least clearance (mm) of a state; infinite before the skin."""
+        return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf
 
     def nearest(self, shapes: Floats) -> "Nearest | None":
         """Return where shapes (…, n, ≥ 3) of the needle are nearest to a zone; None if none is in tissue."""
@@ -137,7 +154,7 @@ class ZoneMap:
         here = points[at]
         ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
         around = np.empty((len(self.names), 6))
-        kernels.fill_distances(self.packed, ends, around)
+        kernels.fill_distances(self.exact, ends, around)
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
         clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
@@ -178,12 +195,12 @@ def _zones_of(
     far = float(margins.max()) + always + radius + _BEYOND_MM
     low, high = map(np.array, corners)
     workspace = Workspace(low, high, far)
-    made = []
-    for zone, margin in zip(zones, margins, strict=True):
-        made.append(_SHAPES[type(zone)](zone, image, workspace, always + float(margin) - least))
-    packed = kernels.pack([one for one, _ in made], least + radius + _BEYOND_MM)
-    added = np.array([always + bound for _, bound in made])
-    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, radius, spacing)
+    made = [_SHAPES[type(zone)](zone, image, workspace) for zone in zones]
+    shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
+    packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
+    rows = kernels.pack(shapes, _ANYWHERE_MM, added).rows
+    exact = kernels.Zones(rows, packed.fields, _ANYWHERE_MM)
+    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, exact, radius, spacing)
 
 
 def sag(spacing: float, distance: float) -> float:
@@ -197,7 +214,8 @@ def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
     path = Path(zone.file)
     try:
         found = path.stat()
-        digest = digest_of(path) if zone.sha256 else None
+        stamp = found.st_mtime_ns, found.st_size
+        digest = _digest_of(path, stamp) if zone.sha256 else None
     except OSError as error:
         raise InputError(f"zone {zone.name}: {path}: cannot be read: {error.strerror}") from error
     if digest != zone.sha256:
@@ -205,7 +223,12 @@ def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
             f"zone {zone.name}: {path}: has changed since the scenario was made (sha256 {digest}); "
             "plan again with the scenario that names it"
         )
-    return found.st_mtime_ns, found.st_size
+    return stamp
+
+
+@lru_cache(maxsize=100)
+def _digest_of(path: Path, _stamp: tuple[int, int]) -> str:
+    return digest_of(path)
 
 
 def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -220,37 +243,35 @@ def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[floa
     return low, high
 
 
-# ---- shapes, larger by `more` (mm); with a bound (mm) of the error of their distances, by which they are larger, too
+# ---- shapes, each with a bound (mm) of the error of its distances
 
 _Made = tuple[kernels.Zone, float]
 
 
-def _sphere(zone: sections.Sphere, _image: object, _workspace: object, more: float) -> _Made:
-    return kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm + more), 0.0
+def _sphere(zone: sections.Sphere, _image: object, _workspace: object) -> _Made:
+    return kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm), 0.0
 
 
-def _capsule(zone: sections.Capsule, _image: object, _workspace: object, more: float) -> _Made:
-    return kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm + more), 0.0
+def _capsule(zone: sections.Capsule, _image: object, _workspace: object) -> _Made:
+    return kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm), 0.0
 
 
-def _box(zone: sections.Box, _image: object, _workspace: object, more: float) -> _Made:
+def _box(zone: sections.Box, _image: object, _workspace: object) -> _Made:
     axes = to_matrix(np.array(zone.rotation)).T
-    return kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes, more), 0.0
+    return kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes), 0.0
 
 
-def _half_space(zone: sections.HalfSpace, _image: object, _workspace: object, more: float) -> _Made:
-    normal = np.array(zone.normal) / np.linalg.norm(zone.normal)
-    return kernels.half_space(np.array(zone.point_mm) + more * normal, normal), 0.0
+def _half_space(zone: sections.HalfSpace, _image: object, _workspace: object) -> _Made:
+    return kernels.half_space(zone.point_mm, zone.normal), 0.0
 
 
-def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Workspace, more: float) -> _Made:
+def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Workspace) -> _Made:
     reader = load_part("distances", (), GROUP)
     to_needle = Rigid(to_matrix(np.array(image.rotation)), np.array(image.translation_mm))
     found: DistanceGrid | None = reader(zone, to_needle, workspace)
     if found is None:
-        return kernels.half_space((-1e9, 0.0, 0.0), (1.0, 0.0, 0.0)), 0.0
-    values = found.values - (found.bound + more)
-    return kernels.grid(values, found.first, np.full(3, found.spacing)), found.bound
+        return kernels.half_space((_NOWHERE_MM, 0.0, 0.0), (1.0, 0.0, 0.0)), 0.0
+    return kernels.grid(found.values, found.first, np.full(3, found.spacing)), found.bound
 
 
 _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
@@ -261,5 +282,5 @@ _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
     sections.ZoneFile: _file,
 }
 
-NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, 0.0, 1.0)
+NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, kernels.NO_ZONES, 0.0, 1.0)
 """The map of a scenario without zones."""

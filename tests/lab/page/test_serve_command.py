@@ -78,7 +78,9 @@ def test_addresses_and_names_that_cannot_be_used_are_refused_in_one_line(capsys,
         taken.listen()
         port = taken.getsockname()[1]
         message = refusal(capsys, "--port", str(port))
-    assert message.startswith(f"cannot listen on 127.0.0.1, port {port}: ")
+        other = refusal(capsys, "--igtl", str(port))
+    for line in (message, other):
+        assert line.startswith(f"cannot listen on 127.0.0.1, port {port}: ")
     assert "--host" in refusal(capsys, "--host", "192.0.2.1", "--port", "0")
     for arguments in (["nonsense"], ["--rig", "nonsense"]):
         assert refusal(capsys, *arguments).startswith("nonsense: no such file, and no such")

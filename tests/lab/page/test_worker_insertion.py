@@ -1,6 +1,7 @@
 """Virtual insertions of the page's worker: equal to `flexneedle.insert`, at any pace, with disturbances."""
 
 import math
+import socket
 from dataclasses import replace
 
 import numpy as np
@@ -8,13 +9,15 @@ import pytest
 
 import flexneedle
 import recorded_page
-from flexneedle.errors import InputError
+from emulated import until
+from flexneedle.errors import InputError, RunError
 from flexneedle.lab.page.job_orders import JobChange
 from flexneedle.lab.page.requests import DisturbRequest
 from flexneedle.lab.page.server.runs_folder import RunsFolder
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
 from flexneedle.lab.page.worker import recordings
 from flexneedle.lab.page.worker.disturbances import DisturbedPlant, Disturber
+from flexneedle.lab.page.worker.igtl_link import IgtlLink
 from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
 from flexneedle.lab.page.worker.recordings import read_run
 from flexneedle.lab.page.worker.task import Cancelled
@@ -22,6 +25,7 @@ from flexneedle.phantom.draw import draw
 from flexneedle.record.export import mark_columns
 from flexneedle.record.fields import page_values
 from flexneedle.record.saving import save
+from igtl_peers import connected, free_port
 from page_tasks import NO_WAIT, Reported, done, plain, short, task
 
 pytestmark = pytest.mark.usefixtures("empty_figures")
@@ -124,6 +128,31 @@ def test_another_controller():
     InsertionJobs().insert(one)
     assert one.report.of("insertion")[-1].controller == "open-loop"
     assert not one.report.shapes(FrameKind.SAMPLES, FrameSource.LIVE)
+
+
+def test_a_peer_of_openigtlink_follows_each_insertion_and_stops_a_paused_one():
+    link = IgtlLink((f"127.0.0.1:{(port := free_port())}", "ImageToNeedle"))
+    worker, one = InsertionJobs(link), task("insert", "insertion", seed=3)
+    with connected(port) as peer:
+        worker.insert(one)
+        summary = one.report.of("insertion")[-1].summary
+        until(lambda: peer.last("NeedleError") and peer.last("NeedleError").string in summary)
+        assert peer.last("NeedlePoints") is not None
+        paused = Reported(lambda message: getattr(message, "state", "") == "paused" and peer.send_stop())
+        two = task("insert", "insertion", seed=3, pace=0.0, reported=paused)
+        with pytest.raises(Cancelled):
+            worker.insert(two)
+    link.close()
+    assert two.report.of("insertion")[-1].summary.startswith("stopped: OpenIGTLink 127.0.0.1:")
+
+
+def test_a_port_that_is_taken_fails_each_insertion(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        worker = InsertionJobs(IgtlLink((f"127.0.0.1:{port}", "ImageToNeedle")))
+        with pytest.raises(RunError, match="cannot listen"):
+            worker.insert(task("insert", "insertion", seed=3))
+    assert "cannot listen on 127.0.0.1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("change", [{"stop": "person 2"}, {"cancel": True}])

@@ -13,12 +13,12 @@ import flexneedle
 from commands import run
 from emulated import DEADLINE_S, until
 from flexneedle.errors import RigError, StoppedError
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkState, LinkStop, LinkTarget, NodeLoss
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
 from flexneedle.lab.rig.supervised import SupervisedRig
 from flexneedle.lab.ros import bridge as module
 from flexneedle.lab.ros.bridge import Bridge, load_checked_profile
 from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.records import NodeLoss, RosArm, RosRefusal, RosState, RosStop, RosTarget
 from flexneedle.loop.events import Ended, PeriodEnded, Planned, Stream
 from flexneedle.planning.events import Iterated
 from flexneedle.record.reader import read_trace
@@ -230,8 +230,8 @@ def test_events_are_published_and_a_stop_ends_the_insertion_at_the_next(bridge):
     made(PeriodEnded(period))
     (sent,) = [one for one in node.published if isinstance(one, Period)]
     assert sent.time > period.time - 60.0  # on the clock of the node
-    assert [one.state for one in node.published if isinstance(one, RosState)][-1] == "inserting"
-    node.records.append((RosStop(0.0, "/stop", "why"),))
+    assert [one.state for one in node.published if isinstance(one, LinkState)][-1] == "inserting"
+    node.records.append((LinkStop(0.0, "/stop", "why"),))
     until(lambda: listed(made))
     for event in (Iterated("feedforward", {}), Planned(plan), PeriodEnded(period)):
         with pytest.raises(StoppedError, match=r"^stopped: ROS topic /stop \(why\)$"):
@@ -240,14 +240,14 @@ def test_events_are_published_and_a_stop_ends_the_insertion_at_the_next(bridge):
 
 
 def test_an_arm_counts_while_it_is_awaited_only(bridge):
-    node, rig = Node([RosArm(0.0, "/arm")]), Rig()
+    node, rig = Node([LinkArm(0.0, "/arm")]), Rig()
     made = bridge(node, arm=True)
     until(lambda: listed(made))
     thread = Thread(target=made.confirm, args=(rig,))
     thread.start()
     until(lambda: len(listed(made)) == 2)
     assert thread.is_alive()
-    node.records.append((RosArm(1.0, "/arm"),))
+    node.records.append((LinkArm(1.0, "/arm"),))
     thread.join(DEADLINE_S)
     assert not thread.is_alive()
     ignored, waits, arm = listed(made)
@@ -259,7 +259,7 @@ def test_an_arm_counts_while_it_is_awaited_only(bridge):
 @pytest.mark.parametrize("arm", [True, False])
 def test_a_stop_before_the_question_stops_the_rig(bridge, arm):
     """It arrives while the insertion is planned, before there is a supervisor."""
-    rig, made = Rig(), bridge(Node([RosStop(0.0, "/stop", "")]), arm=arm)
+    rig, made = Rig(), bridge(Node([LinkStop(0.0, "/stop", "")]), arm=arm)
     until(lambda: listed(made))
     with suppress(StoppedError):
         made.confirm(rig)
@@ -284,8 +284,8 @@ def test_a_supervisor_that_has_ended_is_a_fault_on_the_topic_of_states(bridge):
     rig, made = Rig(), bridge(node := Node())
     made.confirm(rig)
     rig.ended = "killed"
-    until(lambda: any(isinstance(one, RosState) and one.state == "fault" for one in node.published))
-    last = [one for one in node.published if isinstance(one, RosState)][-1]
+    until(lambda: any(isinstance(one, LinkState) and one.state == "fault" for one in node.published))
+    last = [one for one in node.published if isinstance(one, LinkState)][-1]
     assert (last.good, last.reason) == (False, "the supervisor has ended: killed")
 
 
@@ -308,9 +308,9 @@ def test_a_connection_that_fails_is_a_stop(bridge, with_rig):
 
 
 def test_a_stop_is_listed_however_much_was_refused_before(bridge):
-    refused = [RosRefusal(0.0, "/sensor/tip", "old data", count) for count in range(1, 1501)]
-    ignored = [RosArm(0.0, "/flexneedle/arm"), RosTarget(0.0, (35.0, 2.0, 0.0))] * 100
-    made = bridge(Node([*ignored, *refused, RosStop(0.0, "/flexneedle/stop")]))
+    refused = [LinkRefusal(0.0, "/sensor/tip", "old data", count) for count in range(1, 1501)]
+    ignored = [LinkArm(0.0, "/flexneedle/arm"), LinkTarget(0.0, (35.0, 2.0, 0.0))] * 100
+    made = bridge(Node([*ignored, *refused, LinkStop(0.0, "/flexneedle/stop")]))
     until(lambda: made._stopped)
     until(lambda: "stop: ROS topic /flexneedle/stop" in listed(made))
     found = listed(made)

@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 
 import flexneedle
 from flexneedle.geometry.quaternion import to_matrix
+from flexneedle.lab.link.records import LinkState, LinkTarget
 from flexneedle.lab.ros.composer import (
     UNKNOWN_TURN,
     MessageComposer,
@@ -19,7 +20,7 @@ from flexneedle.lab.ros.composer import (
     turn_about_axis,
 )
 from flexneedle.lab.ros.profile import PUBLISHED, load_profile
-from flexneedle.lab.ros.records import JointTargets, RosState, RosTarget
+from flexneedle.lab.ros.records import JointTargets
 from flexneedle.lab.ros.zones import make_clearance, make_zones
 from flexneedle.record.messages import STORE, pose
 from flexneedle.record.writer import TraceWriter
@@ -200,7 +201,7 @@ def test_markers_are_the_layers_and_the_target():
     assert second.pose.position.x + second.scale.x / 2 > PLAN.target[0] * 1e-3
     np.testing.assert_allclose(xyz(ball.pose.position), 1e-3 * np.array(PLAN.target))
     assert ball.scale.x == pytest.approx(0.002)
-    sent = composed(PLAN, RosTarget(3.0, (35.0, -4.0, 1.0)))["markers"].markers
+    sent = composed(PLAN, LinkTarget(3.0, (35.0, -4.0, 1.0)))["markers"].markers
     assert [m.ns for m in sent] == ["tissue", "tissue", "target"], "a new target keeps the layers"
     np.testing.assert_allclose(xyz(sent[-1].pose.position), (0.035, -0.004, 0.001))
     assert [m.ns for m in composed(replace(PLAN, scenario=None))["markers"].markers] == ["target"]
@@ -248,7 +249,7 @@ def test_the_state_is_a_word_and_a_diagnostic_and_targets_of_joints_are_joint_st
     goals = composed(JointTargets(1.0, {"insertion": 0.01, "roll": 3.0}))["joint_targets"]
     assert (goals.name, goals.position.tolist()) == (["insertion", "roll"], [0.01, 3.0])
     assert len(goals.velocity) == len(goals.effort) == 0
-    sent = composed(RosState(1.0, "fault", "motor A is off", good=False, values={"axis": "A"}))
+    sent = composed(LinkState(1.0, "fault", "motor A is off", good=False, values={"axis": "A"}))
     assert sent["state"].data == "fault"
     (status,) = sent["diagnostics"].status
     assert (status.level, status.name, status.message) == (1, "flexneedle: rig", "fault: motor A is off")

@@ -11,11 +11,12 @@ import pytest
 
 import flexneedle
 from emulated import DEADLINE_S, until
+from flexneedle.lab.link.records import LinkState, LinkStop
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.composer import MessageComposer
 from flexneedle.lab.ros.dds import TopicReader, TopicWriter
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, load_profile
-from flexneedle.lab.ros.records import JointTargets, RosState, RosStop, TipReading
+from flexneedle.lab.ros.records import JointTargets, TipReading
 from flexneedle.types import Measurement, Shape
 from lab.ros.fastdds.build import build, label, missing
 from ros_peers import Bool, Peer, cdr
@@ -62,7 +63,7 @@ def test_every_message_of_the_node_returns_unchanged(program, profile):
     records = [
         PLAN,
         PERIOD,
-        RosState(1.0, "armed"),
+        LinkState(1.0, "armed"),
         JointTargets(time.monotonic() + 30.0, {"a": 1.0, "b": 2.0}),
     ]
     composer = MessageComposer(own)
@@ -112,6 +113,6 @@ def test_messages_of_fast_dds_are_read(program):
             tips = [one.position for one in requests if isinstance(one, TipReading)]
             ends = PERIOD.estimate.point, PERIOD.shape[-1, :3]
             read = [any(np.allclose(end, tip, atol=1e-9) for tip in tips) for end in ends]
-            return all(read) and any(isinstance(one, RosStop) for one in requests)
+            return all(read) and any(isinstance(one, LinkStop) for one in requests)
 
         until(answered)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from flexneedle.lab.ros.records import JointReading, RosArm, RosRefusal, RosStop, RosTarget, TipReading
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
+from flexneedle.lab.ros.records import JointReading, TipReading
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "campaigns"))
 import fuzz_ros
@@ -17,11 +18,11 @@ def test_any_bytes_may_be_received():
     done, note = fuzzing.run(fuzz_ros.messages, 3000, 20.0, seed=7)
     assert done == 3000
     assert set(re.findall(r"(\w+)'", note)) >= {
-        "RosArm",
+        "LinkArm",
         "JointReading",
-        "RosRefusal",
-        "RosStop",
-        "RosTarget",
+        "LinkRefusal",
+        "LinkStop",
+        "LinkTarget",
         "TipReading",
     }
 
@@ -33,15 +34,15 @@ def test_a_node_survives_any_bytes_and_still_forwards_a_stop():
 @pytest.mark.parametrize(
     ("key", "record", "found"),
     [
-        ("tip", RosArm(0.0, "/t"), "armed"),
-        ("tip", RosStop(0.0, "/t"), "stop from tip"),
+        ("tip", LinkArm(0.0, "/t"), "armed"),
+        ("tip", LinkStop(0.0, "/t"), "stop from tip"),
         ("tip", None, "no record"),
         ("stop", None, "no record"),
-        ("target", RosTarget(0.0, (float("nan"), 0.0, 0.0)), "position"),
-        ("target", RosTarget(0.0, (2e4, 0.0, 0.0)), "position"),
+        ("target", LinkTarget(0.0, (float("nan"), 0.0, 0.0)), "position"),
+        ("target", LinkTarget(0.0, (2e4, 0.0, 0.0)), "position"),
         ("tip", TipReading(0.0, 1, None, None), "position None"),
         ("tip", TipReading(0.0, 1, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0)), "orientation"),
-        ("tip", RosRefusal(0.0, "/t", "two\nlines"), "reason"),
+        ("tip", LinkRefusal(0.0, "/t", "two\nlines"), "reason"),
         ("joint_states", JointReading(0.0, {}), "no joint"),
     ],
 )

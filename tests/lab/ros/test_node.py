@@ -19,25 +19,15 @@ from cyclonedds.sub import DataReader
 import flexneedle
 from emulated import DEADLINE_S, until
 from flexneedle.errors import InputError, RunError
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkState, LinkStop, LinkTarget, NodeLoss
 from flexneedle.lab.process import MessageChannel
-from flexneedle.lab.ros import client
 from flexneedle.lab.ros.client import NodeClient, open_node
 from flexneedle.lab.ros.composer import MessageComposer
 from flexneedle.lab.ros.dds import TopicReader, TopicWriter, make_user_data
 from flexneedle.lab.ros.node import RosNode, make_memory
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.records import (
-    JointTargets,
-    NodeHeartbeat,
-    NodeLoss,
-    RosArm,
-    RosRefusal,
-    RosState,
-    RosStop,
-    RosTarget,
-    TipReading,
-)
+from flexneedle.lab.ros.records import JointTargets, RosHeartbeat, TipReading
 from flexneedle.types import VISIBLE, Measurement, Shape
 from ros_peers import Bool, Peer, await_requests, cdr, shape, target, tip
 from synthetic import make_periods, make_plan
@@ -95,8 +85,8 @@ def test_periods_reach_a_subscriber_as_they_are_composed(node):
 def test_late_subscribers_get_plan_scene_and_state(node):
     latched = ("plan", "markers", "state")
     node.publish(PLAN)
-    node.publish(RosState(0.0, "armed"))
-    node.publish(RosState(1.0, "inserting"))
+    node.publish(LinkState(0.0, "armed"))
+    node.publish(LinkState(1.0, "inserting"))
     peer = Peer(NEUTRAL, publish=latched)
     until(lambda: all(peer.received(key) for key in latched))
     until(lambda: peer.received("state")[-1].data == "inserting")
@@ -127,28 +117,30 @@ def test_stops_that_readers_have_in_another_order_are_forwarded_once():
     for sources in ((1, 2), (2,), (1, 2)):
         messages = [(cdr(Bool(True)), (7, source)) for source in sources]
         RosNode._forward(node, stops, SimpleNamespace(writers=1, take=lambda messages=messages: messages))
-    assert [type(record) for record in sent] == [RosStop, RosStop]
+    assert [type(record) for record in sent] == [LinkStop, LinkStop]
 
 
 def test_a_stop_an_arm_and_a_target_reach_the_rig(node):
     peer, before = Peer(NEUTRAL, subscribe=("stop", "arm", "target")), time.monotonic()
     peer.await_node(node)
-    (stop, *_) = of_kind(RosStop, peer.ask("stop", lambda: Bool(True), node, RosStop))
-    (arm, *_) = of_kind(RosArm, peer.ask("arm", lambda: Bool(True), node, RosArm))
+    (stop, *_) = of_kind(LinkStop, peer.ask("stop", lambda: Bool(True), node, LinkStop))
+    (arm, *_) = of_kind(LinkArm, peer.ask("arm", lambda: Bool(True), node, LinkArm))
     point = (0.035, -0.005, 0.0)
-    (wanted, *_) = of_kind(RosTarget, peer.ask("target", lambda: target(time.time(), point), node, RosTarget))
+    (wanted, *_) = of_kind(
+        LinkTarget, peer.ask("target", lambda: target(time.time(), point), node, LinkTarget)
+    )
     assert before < stop.time < arm.time < wanted.time < time.monotonic()
     np.testing.assert_allclose(wanted.point, (35.0, -5.0, 0.0))
     node.poll()
     peer.send("stop", Bool(True))
-    stops = await_requests(node, RosStop) + peer.ask("arm", lambda: Bool(True), node, RosArm)
-    assert len(of_kind(RosStop, stops)) == 1, "three readers of stops forward one stop"
+    stops = await_requests(node, LinkStop) + peer.ask("arm", lambda: Bool(True), node, LinkArm)
+    assert len(of_kind(LinkStop, stops)) == 1, "three readers of stops forward one stop"
     unreliable = Peer(NEUTRAL)  # a publisher that does not repeat lost messages
     unreliable.writers["stop"] = TopicWriter(
         unreliable.domain, STOP, BOOL, Qos(Policy.Reliability.BestEffort)
     )
-    (stop, *_) = of_kind(RosStop, unreliable.ask("stop", lambda: Bool(True), node, RosStop))
-    assert stop.topic == STOP
+    (stop, *_) = of_kind(LinkStop, unreliable.ask("stop", lambda: Bool(True), node, LinkStop))
+    assert stop.source == STOP
 
 
 def test_a_latched_stop_is_received_at_the_start_and_a_latched_arm_never():
@@ -159,19 +151,19 @@ def test_a_latched_stop_is_received_at_the_start_and_a_latched_arm_never():
         peer.send(key, Bool(True))
     with open_node(NEUTRAL) as node:
         received = peer.await_node(node)
-        until(lambda: received.extend(node.poll()) or of_kind(RosStop, received))
+        until(lambda: received.extend(node.poll()) or of_kind(LinkStop, received))
         point = (0.035, 0.0, 0.0)  # a target that is sent later has come, and no arm
-        received += peer.ask("target", lambda: target(time.time(), point), node, RosTarget)
-    assert of_kind(RosStop, received)[0].topic == STOP
-    assert of_kind(RosArm, received) == []
+        received += peer.ask("target", lambda: target(time.time(), point), node, LinkTarget)
+    assert of_kind(LinkStop, received)[0].source == STOP
+    assert of_kind(LinkArm, received) == []
 
 
 def test_a_stop_before_the_first_sign_of_life_is_received(monkeypatch):
     class Process:
         def __init__(self, _module, **_):
             self.channel, self.other = map(MessageChannel, socket.socketpair())
-            self.other.send(RosStop(1.0, "/stop"))
-            self.other.send(NodeHeartbeat(time.monotonic(), {}, {}))
+            self.other.send(LinkStop(1.0, "/stop"))
+            self.other.send(RosHeartbeat(time.monotonic(), {}, {}))
 
         def end(self, _seconds):
             self.other.close()
@@ -179,9 +171,9 @@ def test_a_stop_before_the_first_sign_of_life_is_received(monkeypatch):
         def close(self):
             self.channel.close()
 
-    monkeypatch.setattr(client, "ChildProcess", Process)
+    monkeypatch.setattr("flexneedle.lab.link.client.ChildProcess", Process)
     with open_node(NEUTRAL) as node:
-        assert RosStop(1.0, "/stop") in node.poll()
+        assert LinkStop(1.0, "/stop") in node.poll()
 
 
 def test_tips_and_shapes_reach_the_rig(measuring):
@@ -202,15 +194,15 @@ def test_tips_and_shapes_reach_the_rig(measuring):
 
 def test_refused_messages_and_a_second_tracker_are_reported(measuring):
     peer = Peer(NEUTRAL, subscribe=("tip",))
-    received = peer.ask("tip", lambda: tip(time.time(), frame="map"), measuring, RosRefusal)
-    refused = of_kind(RosRefusal, received)[0]
-    assert refused.topic == NEUTRAL.subscribe.tip.topic
+    received = peer.ask("tip", lambda: tip(time.time(), frame="map"), measuring, LinkRefusal)
+    refused = of_kind(LinkRefusal, received)[0]
+    assert refused.source == NEUTRAL.subscribe.tip.topic
     assert "frame_id 'map'" in refused.reason
     Peer(NEUTRAL, subscribe=("tip",)).await_node(measuring)
 
     def is_refused():
-        received = peer.ask("tip", lambda: tip(time.time()), measuring, RosRefusal | TipReading)
-        return any("2 publishers" in refusal.reason for refusal in of_kind(RosRefusal, received))
+        received = peer.ask("tip", lambda: tip(time.time()), measuring, LinkRefusal | TipReading)
+        return any("2 publishers" in refusal.reason for refusal in of_kind(LinkRefusal, received))
 
     until(is_refused)
 
@@ -221,9 +213,9 @@ def test_a_stop_arrives_in_a_flood_of_measurements_whose_refusals_are_limited(me
     begun = time.monotonic()
     for number in range(1000):  # good and bad ones, as fast as they can be sent
         peer.send("tip", tip(time.time(), frame="skin" if number % 2 else "map"))
-    received = peer.ask("stop", lambda: Bool(True), measuring, RosStop)
+    received = peer.ask("stop", lambda: Bool(True), measuring, LinkStop)
     seconds = time.monotonic() - begun
-    assert len(of_kind(RosRefusal, received)) <= 2 + seconds / 0.1  # one in 0.1 s
+    assert len(of_kind(LinkRefusal, received)) <= 2 + seconds / 0.1  # one in 0.1 s
 
 
 @pytest.mark.parametrize(
@@ -268,7 +260,7 @@ def test_an_obstacle_to_a_node_is_one_line(monkeypatch):
         patch.setenv("ROS_DOMAIN_ID", "400")
         with pytest.raises(RunError, match=r"^ROS_DOMAIN_ID = '400'"):
             open_node(NEUTRAL)
-    monkeypatch.setattr(client, "find_spec", lambda _name: None)
+    monkeypatch.setattr("flexneedle.lab.ros.client.find_spec", lambda _name: None)
     with pytest.raises(InputError, match=r"pip install 'flexneedle\[ros\]'"):
         open_node(NEUTRAL)
 

@@ -9,16 +9,11 @@ from hypothesis import strategies as st
 
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import z_axis
-from flexneedle.lab.ros.parsing import LARGEST_BYTES, MOST_POSES, StampClock, Subscription
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
+from flexneedle.lab.link.stamps import StampClock
+from flexneedle.lab.ros.parsing import LARGEST_BYTES, MOST_POSES, Subscription
 from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.records import (
-    JointReading,
-    RosArm,
-    RosRefusal,
-    RosStop,
-    RosTarget,
-    TipReading,
-)
+from flexneedle.lab.ros.records import JointReading, TipReading
 from flexneedle.types import VISIBLE
 from ros_peers import Bool, cdr, joints, shape, target, tip
 
@@ -57,13 +52,13 @@ def test_a_shape_may_have_any_spacing(spacing):
 
 def test_targets_stops_arms_and_joints():
     found = read("target", target(5.0, (0.035, 0.005, 0.0)))
-    assert isinstance(found, RosTarget)
+    assert isinstance(found, LinkTarget)
     np.testing.assert_allclose(found.point, (35.0, 5.0, 0.0))
     for publishers in (1, 2):
-        assert read("stop", Bool(True), publishers=publishers) == RosStop(100.0, "/flexneedle/stop")
+        assert read("stop", Bool(True), publishers=publishers) == LinkStop(100.0, "/flexneedle/stop")
     assert read("stop", Bool(False)) is None
-    assert read("arm", Bool(True)) == RosArm(100.0, "/flexneedle/arm")
-    assert isinstance(read("arm", Bool(False)), RosStop)
+    assert read("arm", Bool(True)) == LinkArm(100.0, "/flexneedle/arm")
+    assert isinstance(read("arm", Bool(False)), LinkStop)
 
 
 NAN = (math.nan, math.nan)
@@ -94,7 +89,7 @@ def test_of_joint_states_only_positions_of_used_joints_count(velocities, efforts
 @pytest.mark.parametrize("data", [b"", b"\x00", b"\x00\x01\x00\x00", b"\x07\x01\x00\x00\x01", b"\xff" * 40])
 def test_an_unreadable_message_on_the_topic_of_stops_is_a_stop(data):
     found = read("stop", data)
-    assert isinstance(found, RosStop)
+    assert isinstance(found, LinkStop)
     assert found.reason.startswith("not a std_msgs/msg/Bool: ")
 
 
@@ -131,7 +126,7 @@ def without_a_position():
 )
 def test_invalid_messages_are_refused(key, message, subject):
     found = read(key, message)
-    assert isinstance(found, RosRefusal), found
+    assert isinstance(found, LinkRefusal), found
     assert found.reason.startswith(subject)
 
 

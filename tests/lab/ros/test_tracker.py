@@ -9,9 +9,10 @@ import pytest
 from emulated import until
 from flexneedle.errors import RigError
 from flexneedle.geometry.rigid import identity
+from flexneedle.lab.link.records import LinkRefusal, NodeLoss
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.records import NodeLoss, RosRefusal, TipReading
+from flexneedle.lab.ros.records import TipReading
 from flexneedle.lab.ros.tracker import RosTracker, make_tracker
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.types import VISIBLE
@@ -70,7 +71,7 @@ def test_the_status_is_the_reason_why_no_frame_arrives(node):
     assert tracker.status == VISIBLE
     tracker._late = 0.0
     assert tracker.status.startswith("no frame for ")
-    node.records = [RosRefusal(0.0, "/tip", "old data")]
+    node.records = [LinkRefusal(0.0, "/tip", "old data")]
     assert tracker.read() == ()
     assert tracker.status == "/tip: old data"
     tracker._late = 60.0

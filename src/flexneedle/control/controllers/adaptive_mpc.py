@@ -31,7 +31,7 @@ from flexneedle.control.path import KNOTS, Ahead, GuidePath, path_of_plan
 from flexneedle.control.reserve import NO_RESERVE, Lever, reserve_of_bevel
 from flexneedle.control.samples import aim_samples, propose_samples
 from flexneedle.costs.normal import moments_above_zero
-from flexneedle.costs.terms import ADAPTIVE_MPC, past_target, per_energy
+from flexneedle.costs.terms import ADAPTIVE_MPC, ZONES, past_target, per_energy
 from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
@@ -44,6 +44,7 @@ from flexneedle.results import format_mm
 from flexneedle.scenario.sections.fields import NonNegative, Positive, count
 from flexneedle.scenario.sections.weights import drop_old_keys, with_weights
 from flexneedle.simulator.excess import LoadLimits
+from flexneedle.simulator.zones import zones_of
 from flexneedle.types import STILL, Floats, Laterals, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
@@ -110,6 +111,7 @@ class Memory:
     roll: float  # the needle's angle (rad) before the command
     scale: float  # energy (mJ) of the tissue down to the target displaced by 1 mm
     loads: LoadLimits  # limits of the guard
+    clear: float | None  # margin of the zones to avoid (mm), None without zones
     # derivatives ahead of the tip, and the guide's lever, None before the first decision
     outlook: Outlook | None = None
     lever: Lever | None = None
@@ -120,7 +122,9 @@ def begin(task: Task) -> Memory:
     """Return the memory at the start, with the plan's path."""
     path, scenario = path_of_plan(task.plan), task.scenario
     scale = scenario.energy_scale(task.plan.target[0])
-    return Memory(path, path, task.plan.roll, scale, LoadLimits.of(scenario))
+    zones = zones_of(scenario)
+    clear = zones.margin if zones else None
+    return Memory(path, path, task.plan.roll, scale, LoadLimits.of(scenario), clear)
 
 
 def decide(
@@ -152,7 +156,9 @@ def decide(
     rest, rests = _rest_time(task, memory, fitted, ahead.left)
     why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
-    after = Memory(path, rolled, fitted.state.roll, memory.scale, memory.loads, outlook, lever, rests)
+    after = replace(
+        memory, path=path, rolled=rolled, roll=fitted.state.roll, outlook=outlook, lever=lever, rests=rests
+    )
     doubt = fitted.doubt
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples, doubt), after
 
@@ -264,7 +270,7 @@ def cost_terms(
         reserve = reserve_of_bevel(fitted, ahead, outlook, lever, bend, target, least=least, margin=margin)
     weights["reach"] *= not guided
     weights["reserve"] *= bool(reserve.sds.any())
-    return ADAPTIVE_MPC.terms(
+    terms = ADAPTIVE_MPC.terms(
         settings,
         weights,
         target=target,
@@ -273,9 +279,11 @@ def cost_terms(
         length=uncorrected,
         expected=expected,
         angle=angle,
+        clear=memory.clear or 0.0,
         **reserve._asdict(),
         **memory.loads.values,
     )
+    return tuple(term for term in terms if term.name not in ZONES or memory.clear is not None)
 
 
 def expected_out_of_reach(

@@ -1,4 +1,4 @@
-"""Options of `flexneedle insert` for a rig and for ROS 2."""
+"""Options of `flexneedle insert` for a rig, ROS 2 and OpenIGTLink."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ from flexneedle.cli.progress import print_line, print_note
 from flexneedle.errors import InputError
 from flexneedle.interrupts import SIGNALS
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions, require_terminal
+from flexneedle.lab.commands.igtl_options import add_igtl, igtl_settings
 from flexneedle.lab.rig.notices import STILL_IN
 from flexneedle.loop.events import AllGates, Gate
 
 if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
+    from flexneedle.lab.igtl.bridge import IgtlBridge
+    from flexneedle.lab.link.bridge import LinkBridge
+    from flexneedle.lab.link.records import LinkTarget
     from flexneedle.lab.rig.rig_file import RigFile, RosSettings
     from flexneedle.lab.ros.bridge import Bridge
     from flexneedle.planning.events import Listener
@@ -47,6 +51,7 @@ def add_options(commands: Commands) -> None:
         metavar="PROFILE",
         help="without --rig: publish to ROS 2 and subscribe to the stop topic; name or path of a profile",
     )
+    add_igtl(parser, target=True)
     parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
 
 
@@ -56,51 +61,82 @@ def _connection(args: argparse.Namespace) -> Connection:
         return RigConnection(args)
     if args.dry_run:
         raise InputError("--dry-run: needs --rig FILE; without a rig every insertion is virtual")
-    return Connection(args) if args.ros is None else RosConnection(args)
+    return LinkedConnection(args)
 
 
-class RosConnection(Connection):
-    """The virtual rig, with an insertion that is published to ROS 2 and can be stopped there."""
+class LinkedConnection(Connection):
+    """The virtual rig, with an insertion that other programs follow and stop, over ROS 2 or OpenIGTLink."""
 
-    _bridge: Bridge | None = None
+    _ros_bridge: Bridge | None = None
+    _igtl_bridge: IgtlBridge | None = None
+
+    @property
+    def _bridges(self) -> dict[str, LinkBridge]:
+        found = {"ros": self._ros_bridge, "igtl": self._igtl_bridge}
+        return {name: bridge for name, bridge in found.items() if bridge is not None}
 
     def _ros(self) -> RosSettings | None:
         from flexneedle.lab.rig.rig_file import RosSettings, check_settings
 
-        return check_settings(RosSettings, {"profile": self.args.ros})
+        return None if self.args.ros is None else check_settings(RosSettings, {"profile": self.args.ros})
 
     def start(self, stack: ExitStack, scenario: Scenario) -> Scenario:
-        """Open the connection to ROS, and wait for the target if it comes from there."""
-        settings = self._ros()
-        if settings is None:
-            return scenario
-        if settings.target and self.args.target is not None:
-            raise InputError(
-                "--target: not with target = true in [ros] of the rig file, which takes it from ROS"
-            )
-        from flexneedle.lab.ros.bridge import Bridge
+        """Open the connections, and wait for the target if it comes from there."""
+        ros, igtl = self._ros(), igtl_settings(self.args)
+        self._check_targets(ros)
+        if ros is not None:
+            from flexneedle.lab.ros.bridge import Bridge
 
-        self._bridge = stack.enter_context(Bridge(settings, print_line))
-        return with_target(scenario, self._bridge.await_target()) if settings.target else scenario
+            self._ros_bridge = stack.enter_context(Bridge(ros, print_line))
+        if igtl is not None:
+            from flexneedle.lab.igtl.bridge import IgtlBridge
+
+            self._igtl_bridge = stack.enter_context(IgtlBridge(igtl, print_line))
+        if self._ros_bridge is not None and ros is not None and ros.target:
+            return with_target(scenario, self._ros_bridge.await_target())
+        if self._igtl_bridge is not None and self.args.igtl_target:
+            return with_path(scenario, self._igtl_bridge.await_target())
+        return scenario
+
+    def _check_targets(self, ros: RosSettings | None) -> None:
+        """Raise InputError for a second source of the target, and for --igtl-target without --igtl."""
+        by_ros = ros is not None and ros.target
+        where = "with target = true in [ros] of the rig file, which takes it from ROS"
+        if by_ros and self.args.target is not None:
+            raise InputError(f"--target: not {where}")
+        if not self.args.igtl_target:
+            return
+        if self.args.igtl is None:
+            raise InputError("--igtl-target: needs --igtl")
+        if by_ros:
+            raise InputError(f"--igtl-target: not {where}")
+        if self.args.target is not None:
+            raise InputError("--target: not with --igtl-target, which takes it from OpenIGTLink")
 
     def add_record(self, folder: Folder) -> None:
-        """Add what was received and refused, and a loss of the node, to `timing`."""
-        if self._bridge is not None:
-            folder.timing["ros"] = self._bridge.record
+        """Add what was received and refused, and a loss of a node, to `timing`."""
+        folder.timing |= {name: bridge.record for name, bridge in self._bridges.items()}
 
     def listeners(self, progress: Progress) -> tuple[Listener, ...]:
-        """Return the connection to ROS, whose lines are printed above the progress from now on."""
-        if self._bridge is None:
-            return ()
-        self._bridge.show = progress.print_line
-        return (self._bridge,)
+        """Return the connections, whose lines are printed above the progress from now on."""
+        for bridge in self._bridges.values():
+            bridge.show = progress.print_line
+        return tuple(self._bridges.values())
 
     def gate(self, progress: Progress, scenario: Scenario) -> Gate | None:
-        """Return the connection to ROS."""
-        return self._bridge
+        """Return the gates of the connections."""
+        return AllGates(*self._bridges.values())
 
 
-class RigConnection(RosConnection):
+def with_path(scenario: Scenario, path: LinkTarget) -> Scenario:
+    """Return the scenario with target, and entry if there is one. Raises ScenarioError for one out of reach."""
+    if path.entry is not None:
+        _, y, z = path.entry
+        scenario = scenario.with_values({"entry.lateral_mm": y, "entry.lateral_z_mm": z})
+    return with_target(scenario, path.point)
+
+
+class RigConnection(LinkedConnection):
     """The rig of a rig file, which the user confirms before motors move."""
 
     def __init__(self, args: argparse.Namespace) -> None:
@@ -147,9 +183,9 @@ class RigConnection(RosConnection):
         return started
 
     def gate(self, progress: Progress, scenario: Scenario) -> Gate:
-        """Return the gate of ROS, followed by the user's."""
+        """Return the gates of the connections, followed by the user's."""
         asked = _UserGate(progress, scenario, moves=self._rig.moves, question="Insert?" if self._asks else "")
-        return asked if self._bridge is None else AllGates(self._bridge, asked)
+        return AllGates(*self._bridges.values(), asked)
 
     def end(self) -> None:
         """Print how the needle is withdrawn."""

@@ -16,6 +16,7 @@ from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import port
 from flexneedle.errors import InputError
 from flexneedle.files import RUNS
+from flexneedle.lab.commands.igtl_options import add_igtl, igtl_settings
 
 if TYPE_CHECKING:
     from flexneedle.lab.page.server.connected_rig import RigReference
@@ -50,6 +51,7 @@ def add_parser(commands: Commands) -> None:
         help="path of a rig file, or emulated; nothing moves before the rig is armed on the page (default: "
         "virtual phantom)",
     )
+    add_igtl(parser, target=False)
     parser.add_argument(
         "--runs",
         type=expand_home,
@@ -103,7 +105,11 @@ def _setup(args: argparse.Namespace) -> PageSetup:
 
     session = PageSession.of(Path(args.scenario).name, load_scenario(args.scenario))
     rig = None if args.rig is None else _load_rig(args.rig)
-    workers = (_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (_WORKER, "insertion")
+    plans, igtl = "plans" if rig is None else "plans-beside-a-rig", igtl_settings(args)
+    if igtl is not None:
+        igtl.address.require_free()
+    link = () if igtl is None else (str(igtl.address), igtl.registration)
+    workers = (_WORKER, plans), (_WORKER, "insertion", *link)
     return PageSetup(session, args.runs, PageLimits() if rig is None else RIG_LIMITS, workers, rig)
 
 

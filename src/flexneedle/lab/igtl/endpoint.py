@@ -114,8 +114,23 @@ class IgtlClient(Endpoint):
                 last = ""
                 await asyncio.shield(peer.closed)
             except OSError as error:
-                why = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)
+                why = _explain(error)
                 if why != last:
                     self._log(f"{self.host}:{self.port}: no connection, trying again: {why}")
                 last = why
             await asyncio.sleep(_RETRY_S)
+
+
+def make_endpoint(receive: Receive, log: Log, host: str, port: int, *, connects: bool) -> Endpoint:
+    """Return a client of the server at an address, or the server itself."""
+    kind: type[Endpoint] = IgtlClient if connects else IgtlServer
+    return kind(receive, log, host, port)
+
+
+def describe_failure(host: str, port: int, error: OSError) -> str:
+    """Return why a server cannot be opened."""
+    return f"cannot listen on {host}, port {port}: {_explain(error)}"
+
+
+def _explain(error: OSError) -> str:
+    return os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 
+from flexneedle.lab.link.records import LinkState, LinkTarget
 from flexneedle.lab.ros.frames import FrameMap
 from flexneedle.lab.ros.markers import (
     MarkerScene,
@@ -17,7 +18,7 @@ from flexneedle.lab.ros.markers import (
     make_zone_markers,
 )
 from flexneedle.lab.ros.profile import PlacedTopic, ShapeTopic, TopicProfile
-from flexneedle.lab.ros.records import JointTargets, RosClearance, RosState, RosTarget, RosZones
+from flexneedle.lab.ros.records import JointTargets, RosClearance, RosZones
 from flexneedle.record.fields import FIELDS
 from flexneedle.record.messages import (
     Check,
@@ -192,7 +193,7 @@ def _make_plan_markers(composer: MessageComposer, plan: Plan) -> Any:
     return make_markers(composer.make_header("markers", 0.0), composer.frames["markers"], composer.scene)
 
 
-def _make_target_markers(composer: MessageComposer, target: RosTarget) -> Any:
+def _make_target_markers(composer: MessageComposer, target: LinkTarget) -> Any:
     composer.scene = replace(composer.scene, target=target.point)
     header = composer.make_header("markers", target.time)
     return make_markers(header, composer.frames["markers"], composer.scene)
@@ -254,11 +255,11 @@ def _make_targets(composer: MessageComposer, record: JointTargets) -> JointState
 # State
 
 
-def _make_state(_composer: MessageComposer, record: RosState) -> String:
+def _make_state(_composer: MessageComposer, record: LinkState) -> String:
     return String(record.state)
 
 
-def _make_rig_diagnostics(composer: MessageComposer, record: RosState) -> DiagnosticArray:
+def _make_rig_diagnostics(composer: MessageComposer, record: LinkState) -> DiagnosticArray:
     text = f"{record.state}: {record.reason}" if record.reason else record.state
     found = statuses(record.time, "flexneedle: rig", [Check(text, record.good, record.values)])
     return replace(found, header=composer.make_header("diagnostics", record.time))
@@ -283,9 +284,9 @@ _BUILDERS: dict[type, dict[str, Callable[[MessageComposer, Any], Any]]] = {
         "joint_states": _make_joints,
         "diagnostics": _make_period_diagnostics,
     },
-    RosTarget: {"markers": _make_target_markers},
+    LinkTarget: {"markers": _make_target_markers},
     RosZones: {"zones": _make_zones},
     RosClearance: {"clearance": _make_clearance},
-    RosState: {"state": _make_state, "diagnostics": _make_rig_diagnostics},
+    LinkState: {"state": _make_state, "diagnostics": _make_rig_diagnostics},
     JointTargets: {"joint_targets": _make_targets},
 }

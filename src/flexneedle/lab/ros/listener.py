@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass, field
 
 from flexneedle.errors import make_printable
+from flexneedle.lab.link.records import LinkRefusal, LinkStop
 from flexneedle.lab.ros.dds import (
     DomainDirectory,
     TopicReader,
@@ -15,7 +16,6 @@ from flexneedle.lab.ros.dds import (
 from flexneedle.lab.ros.node import make_inputs
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import TopicProfile
-from flexneedle.lab.ros.records import RosRefusal, RosStop
 from flexneedle.ports import Clock
 
 _PAUSE_S = 0.01
@@ -90,9 +90,9 @@ class _Topic:
             if source not in self.sources:  # a stop has several readers
                 self.sources.add(source)
                 match self.subscription.read(data, now, publishers):
-                    case RosStop(reason=reason):
+                    case LinkStop(reason=reason):
                         self.problem = f"{reason or 'true'}: an insertion would be stopped"
-                    case RosRefusal(reason=reason):
+                    case LinkRefusal(reason=reason):
                         self.problem = f"a message is refused: {reason}"
 
     def summarize(self, now: float, publishers: list[tuple[str, str]]) -> TopicActivity:

@@ -15,11 +15,13 @@ from threading import Thread
 from typing import Any, Self
 
 from flexneedle.errors import DriverError, FlexneedleError, make_printable, one_line
+from flexneedle.lab.link.fields import DeviceAge
+from flexneedle.lab.link.records import LinkRefusal, NodeLoss
 from flexneedle.lab.rig.devices.priority import set_normal_priority
 from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.lab.ros.client import NodeClient
-from flexneedle.lab.ros.profile import DeviceAge, TopicProfile, load_part
-from flexneedle.lab.ros.records import JointReading, JointTargets, NodeLoss, RosRefusal
+from flexneedle.lab.ros.profile import TopicProfile, load_part
+from flexneedle.lab.ros.records import JointReading, JointTargets
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.fields import Section
 
@@ -88,7 +90,7 @@ class JointLink:
             if isinstance(record, JointReading):
                 self._refused = self._position_problem(record)
                 self._reading = self._reading if self._refused else record
-            elif isinstance(record, RosRefusal):
+            elif isinstance(record, LinkRefusal):
                 self._refused = f": {record.reason}"
             elif isinstance(record, NodeLoss):
                 self._lost = record.reason

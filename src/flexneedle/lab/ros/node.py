@@ -16,21 +16,13 @@ from time import monotonic
 from cyclonedds.domain import DomainParticipant
 
 from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, NodeLoss
 from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.ros.composer import MessageComposer
 from flexneedle.lab.ros.dds import TopicReader, TopicWriter, join_domain, make_waitset
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, TopicProfile
-from flexneedle.lab.ros.records import (
-    JointTargets,
-    NodeHeartbeat,
-    NodeLoss,
-    NodeSetup,
-    Received,
-    RosArm,
-    RosRefusal,
-    RosStop,
-)
+from flexneedle.lab.ros.records import JointTargets, NodeSetup, Received, RosHeartbeat
 
 BEAT_S = 0.1
 STALE_S = 0.1
@@ -108,9 +100,9 @@ class RosNode:
                 self._channel.send(self._make_heartbeat(now), keep=False)
             waitset.wait(round(1e9 * BEAT_S))
 
-    def _make_heartbeat(self, now: float) -> NodeHeartbeat:
+    def _make_heartbeat(self, now: float) -> RosHeartbeat:
         publishers = {one.key: readers[0].writers for one, readers in self._inputs}
-        return NodeHeartbeat(now, {key: one.readers for key, one in self._writers.items()}, publishers)
+        return RosHeartbeat(now, {key: one.readers for key, one in self._writers.items()}, publishers)
 
     def _forward(self, subscription: Subscription, reader: TopicReader) -> None:
         publishers = reader.writers
@@ -120,15 +112,15 @@ class RosNode:
             self._read[subscription.key].append(source)
             record = subscription.read(data, monotonic(), publishers)
             if record is not None and not self._is_repeated(record):
-                self._channel.send(record, keep=isinstance(record, RosStop | RosArm))
+                self._channel.send(record, keep=isinstance(record, LinkStop | LinkArm))
 
     def _is_repeated(self, record: Received) -> bool:
         """Return whether a record is a refusal soon after one of the same topic, as in a flood of messages."""
-        if not isinstance(record, RosRefusal):
+        if not isinstance(record, LinkRefusal):
             return False
-        if record.time - self._refused.get(record.topic, -1.0) < BEAT_S:
+        if record.time - self._refused.get(record.source, -1.0) < BEAT_S:
             return True
-        self._refused[record.topic] = record.time
+        self._refused[record.source] = record.time
         return False
 
 

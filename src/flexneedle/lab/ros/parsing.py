@@ -1,24 +1,16 @@
 """Conversion of received messages to records, with checks: other nodes may send anything."""
 
-import math
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from rosbags.serde import SerdeError
 
 from flexneedle.errors import InputError, make_printable
+from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
+from flexneedle.lab.link.stamps import StampClock
 from flexneedle.lab.ros.frames import FrameMap
 from flexneedle.lab.ros.profile import SUBSCRIBED, PlacedTopic, TopicProfile
-from flexneedle.lab.ros.records import (
-    JointReading,
-    Received,
-    RosArm,
-    RosRefusal,
-    RosStop,
-    RosTarget,
-    TipReading,
-)
+from flexneedle.lab.ros.records import JointReading, Received, TipReading
 from flexneedle.record.messages import STORE, Header
 from flexneedle.types import VISIBLE, Point
 
@@ -29,54 +21,6 @@ _BOOL, _HEADER = "std_msgs/msg/Bool", 4  # bytes before the value
 _OF_ONE = ("tip", "shape", "joint_states")
 _MOST_JOINTS = 1000  # of a robot, of which the rig uses a few
 _LONGEST_TEXT = 60
-_WINDOW_S = 10.0
-_MOST_IN_WINDOW = 1000
-_OBSERVED_S = 0.5  # of a clock that was set back, before a time is derived from it
-
-
-class StampClock:
-    """Times of measurement on the clock of this computer, from the stamps and arrivals of one topic.
-
-    The sender's clock differs by an unknown amount, estimated as the smallest difference of arrival and stamp in the
-    last 10 s (the message with the least delay). A delayed message thus keeps its earlier time, and no time is later
-    than the arrival. Messages with a stamp before the last one are refused. If two of them are in order, the clock was
-    set back or both were delayed: earlier differences are forgotten, and messages are refused until differences of half
-    a second are known. A single old message has no effect, because it may be a delayed one.
-    """
-
-    def __init__(self) -> None:
-        self._differences: deque[tuple[float, float]] = deque(maxlen=_MOST_IN_WINDOW)
-        self._last = -math.inf  # the largest stamp that was not old
-        self._newest = -math.inf  # the largest stamp since the clock was last set back
-        self._behind: float | None = None  # stamp of the previous message, if it was before the newest
-        self._since = -math.inf  # arrival at which observation of the clock began
-
-    def to_time(self, stamp: float, arrival: float) -> float:
-        """Return the time (s) of measurement, on the clock of `arrival`, of a message with `stamp` (s).
-
-        Raises InputError if the message is not newer than the one before, or has no stamp to detect old data by.
-        """
-        if stamp == 0.0:
-            raise InputError("no time stamp: old data could not be recognised")
-        if stamp <= self._newest and self._behind is not None and stamp > self._behind:
-            self._newest, self._since = -math.inf, arrival
-            self._differences.clear()
-        self._behind = stamp if stamp <= self._newest else None
-        if self._behind is None:
-            self._newest = stamp
-            self._add(arrival, stamp)
-        if stamp <= self._last:
-            back = self._last - stamp
-            raise InputError(f"old data: its stamp is {back:.3f} s before the last message's")
-        self._last = stamp
-        if arrival < self._since + _OBSERVED_S:
-            raise InputError(f"its clock was set back: refused until observed for {_OBSERVED_S:g} s")
-        return stamp + min(difference for _, difference in self._differences)
-
-    def _add(self, arrival: float, stamp: float) -> None:
-        self._differences.append((arrival, arrival - stamp))
-        while self._differences[0][0] < arrival - _WINDOW_S:
-            self._differences.popleft()
 
 
 class Subscription:
@@ -92,8 +36,8 @@ class Subscription:
     def read(self, data: bytes, arrival: float, publishers: int = 1) -> Received | None:
         """Return the record of a message in CDR that arrived at `arrival` (s, monotonic); None for no request.
 
-        publishers: number of publishers of the topic. A message that cannot be accepted gives a `RosRefusal`, on the
-        topic of stops a `RosStop`.
+        publishers: number of publishers of the topic. A message that cannot be accepted gives a `LinkRefusal`, on the
+        topic of stops a `LinkStop`.
         """
         self.number += 1
         try:
@@ -103,8 +47,8 @@ class Subscription:
         except InputError as error:
             self.refused += 1
             if self.key == "stop":
-                return RosStop(arrival, self.topic, str(error))
-            return RosRefusal(arrival, self.topic, str(error), self.refused)
+                return LinkStop(arrival, self.topic, str(error))
+            return LinkRefusal(arrival, self.topic, str(error), self.refused)
 
     def check_frame(self, header: Header) -> FrameMap:
         """Return the map of the topic's frame. Raises InputError if a message has another frame."""
@@ -131,18 +75,18 @@ class Subscription:
 
 
 def _parse_stop(subscription: Subscription, message: Any, arrival: float) -> Received | None:
-    return RosStop(arrival, subscription.topic) if message.data else None
+    return LinkStop(arrival, subscription.topic) if message.data else None
 
 
 def _parse_arm(subscription: Subscription, message: Any, arrival: float) -> Received:
     topic = subscription.topic
-    return RosArm(arrival, topic) if message.data else RosStop(arrival, topic, "disarmed")
+    return LinkArm(arrival, topic) if message.data else LinkStop(arrival, topic, "disarmed")
 
 
 def _parse_target(subscription: Subscription, message: Any, arrival: float) -> Received:
     point = subscription.check_frame(message.header).to_point(message.point)
     subscription.check_stamp(message.header, arrival)
-    return RosTarget(arrival, point)
+    return LinkTarget(arrival, point)
 
 
 def _parse_tip(subscription: Subscription, message: Any, arrival: float) -> TipReading:

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from flexneedle.errors import RigError
+from flexneedle.lab.link.fields import AxisName, make_unit
 from flexneedle.scenario.library import Library
 from flexneedle.scenario.problems import Problem, refuse, to_line
 from flexneedle.scenario.sections.environment import Vector
@@ -21,7 +22,6 @@ from flexneedle.types import Floats
 
 PROFILES = Library("a profile of ROS topics", "profile", files(__package__) / "profiles", RigError)
 
-AxisName = Literal["x", "y", "z", "-x", "-y", "-z"]
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LONGEST = 200
 
@@ -35,8 +35,6 @@ def _check_name(name: str) -> str:
 
 
 TopicName = Annotated[str, AfterValidator(_check_name)]
-DeviceAge = Annotated[float, Field(gt=0, le=1000)]
-"""Age of data of a device (ms)."""
 
 
 class AxisNames(Section):
@@ -52,7 +50,7 @@ class AxisNames(Section):
     @property
     def rotation(self) -> Floats:
         """Matrix (3, 3) from coordinates of the insertion to coordinates along these axes."""
-        return np.array([_make_unit(self.x), _make_unit(self.y), _make_unit(self.z)]).T
+        return np.array([make_unit(self.x), make_unit(self.y), make_unit(self.z)]).T
 
     @model_validator(mode="after")
     def _check_handedness(self) -> Self:
@@ -60,11 +58,6 @@ class AxisNames(Section):
             rule = "must be three different axes, right-handed, such as x = z, y = y, z = -x"
             refuse([Problem((), [self.x, self.y, self.z], rule)])
         return self
-
-
-def _make_unit(axis: AxisName) -> list[float]:
-    sign = -1.0 if axis.startswith("-") else 1.0
-    return [sign * (name == axis[-1]) for name in "xyz"]
 
 
 class FrameAxes(AxisNames):

@@ -1,12 +1,13 @@
-"""Records that a rig and its ROS node exchange, besides `Plan` and `Period`.
+"""Records that a rig and its ROS node exchange, besides `flexneedle.lab.link.records`.
 
-Lengths are in mm in the frame of the insertion: x along its axis into the tissue, y and z across. Times are in s: of
-published records on the clock of the run, of received records on `time.monotonic()`.
+Lengths are in mm in the frame of the insertion: x along its axis into the tissue, y and z across. Times are in s on
+`time.monotonic()`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from flexneedle.lab.link.records import NodeHeartbeat, Requested
 from flexneedle.lab.ros.profile import TopicProfile
 from flexneedle.types import VISIBLE, Floats, Point, Quaternion
 
@@ -14,27 +15,8 @@ from flexneedle.types import VISIBLE, Floats, Point, Quaternion
 
 
 @dataclass(frozen=True)
-class RosState:
-    """State of the rig by name, such as "armed", with its reason, whether it is good, and more values."""
-
-    time: float
-    state: str
-    reason: str = ""
-    good: bool = True
-    values: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class RosTarget:
-    """A target that is published, or that another node requests."""
-
-    time: float
-    point: Point
-
-
-@dataclass(frozen=True)
 class JointTargets:
-    """Goals of joints by name, in the unit of the joint (m or rad). time: `time.monotonic()`."""
+    """Goals of joints by name, in the unit of the joint (m or rad)."""
 
     time: float
     positions: Mapping[str, float]
@@ -71,23 +53,6 @@ class RosClearance:
 
 
 @dataclass(frozen=True)
-class RosStop:
-    """A request to stop, or an unreadable message on the topic of stops."""
-
-    time: float
-    topic: str
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class RosArm:
-    """A request to arm the rig."""
-
-    time: float
-    topic: str
-
-
-@dataclass(frozen=True)
 class TipReading:
     """A tip at its time of measurement. orientation: its z is the needle's axis; None if unknown.
 
@@ -109,24 +74,6 @@ class JointReading:
     positions: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class RosRefusal:
-    """A refused message. count: refused messages of the topic, this one included."""
-
-    time: float
-    topic: str
-    reason: str
-    count: int = 1
-
-
-@dataclass(frozen=True)
-class NodeLoss:
-    """The node has ended or does not answer: nothing more is received, not even a stop."""
-
-    time: float
-    reason: str
-
-
 # Between the two processes
 
 
@@ -139,16 +86,14 @@ class NodeSetup:
 
 
 @dataclass(frozen=True)
-class NodeHeartbeat:
-    """A sign of life of the node; the first one reports that it is ready.
+class RosHeartbeat(NodeHeartbeat):
+    """A sign of life of the node.
 
     subscribers: number of subscribers by key of `publish`; publishers: number of publishers by key of `subscribe`.
     """
 
-    time: float
     subscribers: Mapping[str, int]
     publishers: Mapping[str, int]
 
 
-Published = RosState | RosTarget | JointTargets | RosZones | RosClearance
-Received = RosStop | RosArm | RosTarget | TipReading | JointReading | RosRefusal | NodeLoss
+Received = Requested | TipReading | JointReading

@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from time import monotonic
 from typing import Any, Literal, Self
 
+from flexneedle.lab.link.fields import DeviceAge
+from flexneedle.lab.link.records import LinkRefusal
 from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.lab.ros.client import NodeClient
-from flexneedle.lab.ros.profile import DeviceAge, load_part
-from flexneedle.lab.ros.records import Received, RosRefusal, TipReading
+from flexneedle.lab.ros.profile import load_part
+from flexneedle.lab.ros.records import Received, TipReading
 from flexneedle.ports import Clock
 from flexneedle.scenario.sections.fields import Section
 from flexneedle.types import TIP, VISIBLE, Frame, SensorReading
@@ -63,8 +65,8 @@ class RosTracker:
         return VISIBLE if silent < self._late else self._refused or f"no frame for {silent:.1f} s"
 
     def _take_tip(self, record: Received) -> TipReading | None:
-        if isinstance(record, RosRefusal):
-            self._refused = f"{record.topic}: {record.reason}"
+        if isinstance(record, LinkRefusal):
+            self._refused = f"{record.source}: {record.reason}"
         return record if isinstance(record, TipReading) else None
 
     def _to_frame(self, tip: TipReading) -> Frame:

@@ -133,7 +133,7 @@ def message(call, *arguments):
 def test_registered_parts_exist(group):
     points = PROJECT["entry-points"].get(group, {})
     assert all(callable(load_part(value, ())) for value in points.values())
-    assert {DRIVERS: {"galil", "ros"}, TRACKERS: {"aurora", "replay", "ros"}}[group] <= set(points)
+    assert {DRIVERS: {"galil", "ros"}, TRACKERS: {"aurora", "igtl", "replay", "ros"}}[group] <= set(points)
 
 
 def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():

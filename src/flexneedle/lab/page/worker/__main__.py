@@ -1,4 +1,6 @@
-"""A worker: `python -m flexneedle.lab.page.worker CHANNEL NAME`, started by the page's server.
+"""A worker: `python -m flexneedle.lab.page.worker CHANNEL NAME [ADDRESS REGISTRATION]`, started by the page's server.
+
+ADDRESS, REGISTRATION: of its insertions' connection to OpenIGTLink.
 
 All workers are the same, except that `plans-beside-a-rig` has a lower priority.
 """
@@ -11,6 +13,7 @@ from collections.abc import Callable, Mapping
 
 from flexneedle.errors import FlexneedleError, ScenarioWarning, describe_error, one_line
 from flexneedle.lab.page.job_orders import Action, WorkerReady
+from flexneedle.lab.page.worker.igtl_link import IgtlLink
 from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
 from flexneedle.lab.page.worker.plan_jobs import estimate, needle, plan, warm_up
 from flexneedle.lab.page.worker.reach_job import reach
@@ -22,6 +25,8 @@ from flexneedle.lab.process import open_channel
 from flexneedle.record.folder import versions
 
 Actions = Mapping[Action, Callable[[WorkerTask], None]]
+_OPTIONS = 3
+"""First argument of the connection to OpenIGTLink."""
 _NICE = 10
 """Niceness of plans beside a rig, whose insertion has priority. Otherwise estimates are faster without it, above all
 where the browser draws without a graphics processor."""
@@ -39,7 +44,8 @@ def main() -> int:
     warm_up()
     versions()  # read now, while the files are still those that were imported
     channel.send(WorkerReady())
-    insertions, rows = InsertionJobs(), ShownRows()
+    link, rows = IgtlLink(sys.argv[_OPTIONS:]), ShownRows()
+    insertions = InsertionJobs(link)
     actions: Actions = {
         "needle": needle,
         "estimate": estimate,
@@ -57,6 +63,7 @@ def main() -> int:
     while (task := tasks.next()) is not None:
         carry_out(task, actions)
         tasks.close(task)
+    link.close()
     return 0
 
 

@@ -1,17 +1,19 @@
 """Insertions on the virtual rig at any pace, and on the connected rig; each period is reported when it ends."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import monotonic
 
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
+from flexneedle.lab.link.bridge import LinkBridge
 from flexneedle.lab.page.worker.disturbances import DisturbedRig, Disturber
+from flexneedle.lab.page.worker.igtl_link import IgtlLink
 from flexneedle.lab.page.worker.insertion_reporter import InsertionReporter
 from flexneedle.lab.page.worker.recordings import save_complete
 from flexneedle.lab.page.worker.rig_insertion import insert_on_rig
 from flexneedle.lab.page.worker.task import Cancelled, JobControl, WorkerTask
-from flexneedle.loop.events import PeriodEnded
+from flexneedle.loop.events import PeriodEnded, Planned
 from flexneedle.loop.insertions import insert
-from flexneedle.planning.events import Event
+from flexneedle.planning.events import Event, send_event
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.results import Insertion
@@ -20,9 +22,13 @@ _AT_ONCE_S = 1e-6
 
 
 class InsertionJobs:
-    """Insertions of this worker; the last virtual one can be saved once it has ended."""
+    """Insertions of this worker; the last virtual one can be saved once it has ended.
 
-    def __init__(self) -> None:
+    link: connection to OpenIGTLink (default: none).
+    """
+
+    def __init__(self, link: IgtlLink | None = None) -> None:
+        self._link = link or IgtlLink()
         self._last: Insertion | None = None
 
     def insert(self, task: WorkerTask) -> None:
@@ -31,7 +37,9 @@ class InsertionJobs:
         reporter = InsertionReporter(task)
         reporter.announce("planning")
         try:
-            ended = insert_on_rig(reporter) if task.order.rig else _insert_virtually(reporter)
+            with self._link.insertion(task) as bridges:
+                insert_it = insert_on_rig if task.order.rig else _insert_virtually
+                ended = insert_it(reporter, bridges)
         except (Cancelled, StoppedError) as end:
             reporter.announce("interrupted", one_line(end) if isinstance(end, StoppedError) else "cancelled")
             raise Cancelled from None
@@ -48,12 +56,15 @@ class InsertionJobs:
         save_complete(self._last, task.order.folder)
 
 
-def _insert_virtually(reporter: InsertionReporter) -> Insertion:
-    """Insert on a virtual rig that can be disturbed."""
+def _insert_virtually(reporter: InsertionReporter, bridges: Mapping[str, LinkBridge]) -> Insertion:
+    """Insert on a virtual rig that can be disturbed. bridges: further listeners, by key."""
     task, order, control = reporter.task, reporter.task.order, reporter.task.control
 
-    plan = make_plan(task.scenario, strategy=order.strategy, seed=order.seed, listeners=[reporter.take])
+    plan = make_plan(
+        task.scenario, strategy=order.strategy, seed=order.seed, listeners=[reporter.take, *bridges.values()]
+    )
     reporter.report_plan(plan)
+    send_event(Planned(plan), bridges.values())
     disturber = Disturber(with_planned_entry(task.scenario, plan), task.report)
 
     def disturb() -> None:
@@ -68,7 +79,7 @@ def _insert_virtually(reporter: InsertionReporter) -> Insertion:
         order.seed,
         controller=task.controller,
         rig=DisturbedRig(disturber, pacer.start),
-        listeners=(reporter.take, pacer),
+        listeners=(reporter.take, *bridges.values(), pacer),
     )
 
 

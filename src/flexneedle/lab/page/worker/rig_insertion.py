@@ -1,6 +1,7 @@
 """The connected rig: its check, and insertions on it, as by `flexneedle insert --rig`."""
 
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
@@ -12,6 +13,7 @@ from typing import Any
 from flexneedle.control.controllers import with_controller_defaults
 from flexneedle.errors import StoppedError
 from flexneedle.files import create_folder
+from flexneedle.lab.link.bridge import LinkBridge
 from flexneedle.lab.page.job_orders import SILENT_S, RigReport
 from flexneedle.lab.page.protocol import RigCheckMessage
 from flexneedle.lab.page.rigs import usable_rig
@@ -60,8 +62,10 @@ def check(task: WorkerTask) -> None:
     )
 
 
-def insert_on_rig(reporter: InsertionReporter) -> Insertion:
+def insert_on_rig(reporter: InsertionReporter, bridges: Mapping[str, LinkBridge]) -> Insertion:
     """Plan, open the rig, wait for "go", and insert, with a record in a new folder.
+
+    bridges: further listeners and gates, by key of their record.
 
     Raises StoppedError if it is stopped while it plans, and otherwise as `record_insertion`.
     """
@@ -76,14 +80,19 @@ def insert_on_rig(reporter: InsertionReporter) -> Insertion:
     gate = RigGate(reporter, scenario)
 
     with ExitStack() as stack:
-        listeners: list[Listener] = [reporter.take, gate]
-        gates: list[Gate] = [gate]
+        links = dict(bridges)
         if rig.ros is not None:
-            bridge = stack.enter_context(Bridge(rig.ros, partial(print, file=sys.stderr, flush=True)))
-            listeners, gates = [*listeners, bridge], [bridge, gate]
-            folder.timing["ros"] = bridge.record
+            ros = stack.enter_context(Bridge(rig.ros, partial(print, file=sys.stderr, flush=True)))
+            links["ros"] = ros
+        folder.timing |= {key: bridge.record for key, bridge in links.items()}
+        listeners: list[Listener] = [reporter.take, gate, *links.values()]
         insertion = record_insertion(
-            folder, scenario, order.strategy, choices, listeners=listeners, gate=AllGates(*gates)
+            folder,
+            scenario,
+            order.strategy,
+            choices,
+            listeners=listeners,
+            gate=AllGates(*links.values(), gate),
         )
     reporter.notes += [*folder.problems, *folder.undrawn]
     return insertion

@@ -1,0 +1,104 @@
+"""Requests in received messages: what is read, what is refused, and in which frame points are."""
+
+import math
+
+import numpy as np
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.lab.igtl.messages import (
+    NamedPoint,
+    PointMessage,
+    StringMessage,
+    Trajectory,
+    TrajectoryMessage,
+    TransformMessage,
+)
+from flexneedle.lab.igtl.requests import PathRequest, StopRequest, check_entry, read_request, to_needle
+from flexneedle.lab.igtl.settings import IgtlAddress
+from flexneedle.lab.images.frames import ImageRegistration
+from igtl_messages import EXAMPLES, MATRIX
+
+NAME = "ImageToNeedle"
+
+
+def points(*named):
+    return PointMessage(name="F", points=tuple(NamedPoint(name=name, position=at) for name, at in named))
+
+
+@pytest.mark.parametrize("text", ["STOP", "stop", " Stop\n"])
+def test_a_stop_is_the_text_of_any_string(text):
+    assert read_request(StringMessage(name="anything", text=text), NAME) == StopRequest()
+
+
+def test_other_messages_are_no_requests():
+    unused = [one for kind, one in EXAMPLES.items() if kind not in ("POINT", "TRAJ")]
+    assert [read_request(one, NAME) for one in unused] == [None] * len(unused)
+    assert read_request(StringMessage(name="Command", text="don't STOP"), NAME) is None
+
+
+def test_points_are_found_by_the_beginnings_of_their_names():
+    sent = points(("F-1", (9.0, 9.0, 9.0)), ("Entry-1", (0.0, 1.0, 2.0)), ("TARGET", (3.0, 4.0, 5.0)))
+    assert read_request(sent, NAME) == PathRequest((0.0, 1.0, 2.0), (3.0, 4.0, 5.0))
+    assert read_request(points(("target", (1.0, 2.0, 3.0))), NAME) == PathRequest(None, (1.0, 2.0, 3.0))
+
+
+def test_the_first_trajectory_counts():
+    ways = tuple(Trajectory(name=str(x), entry=(x, 0.0, 0.0), target=(x, 1.0, 0.0)) for x in (1.0, 2.0))
+    found = read_request(TrajectoryMessage(name="T", trajectories=ways), NAME)
+    assert found == PathRequest((1.0, 0.0, 0.0), (1.0, 1.0, 0.0))
+    assert read_request(TrajectoryMessage(name="T", trajectories=()), NAME) is None
+
+
+def test_a_registration_maps_points_of_the_image_by_its_matrix():
+    registration = read_request(TransformMessage(name=NAME, matrix=MATRIX), NAME)
+    assert isinstance(registration, ImageRegistration)
+    point = (10.0, -20.0, 35.0)
+    expected = np.array(MATRIX) @ [*point, 1.0]
+    np.testing.assert_allclose(to_needle(registration, point), expected[:3], atol=1e-4)
+    assert to_needle(None, point) == point
+
+
+@pytest.mark.parametrize("scale", [1.01, -1.0])
+def test_a_registration_that_is_not_rigid_is_refused(scale):
+    matrix = tuple(tuple(scale * value for value in row) for row in MATRIX[:3])
+    with pytest.raises(InputError, match="must be a rotation"):
+        read_request(TransformMessage(name=NAME, matrix=(*matrix, MATRIX[3])), NAME)
+
+
+def test_points_that_cannot_be_are_refused():
+    with pytest.raises(InputError, match="farther than 10 m"):
+        to_needle(None, (2e4, 0.0, 0.0))
+    assert check_entry((-4.9, 30.0, 0.0)) == (-4.9, 30.0, 0.0)
+    with pytest.raises(InputError, match="within 5 mm of the skin"):
+        check_entry((5.1, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("18944", IgtlAddress()),
+        ("0.0.0.0:1", IgtlAddress("0.0.0.0", 1)),
+        ("connect:18945", IgtlAddress(port=18945, connects=True)),
+        ("connect:slicer-pc:18944", IgtlAddress("slicer-pc", connects=True)),
+        ("[::1]:18944", IgtlAddress("::1")),
+    ],
+)
+def test_addresses(text, address):
+    assert IgtlAddress.parse(text) == address
+    assert IgtlAddress.parse(str(address)) == address
+
+
+@pytest.mark.parametrize("text", ["", "phantom", "host:", "1:2:x", "65536", "connect:", "-1", "²"])
+def test_other_addresses_are_refused(text):
+    with pytest.raises(InputError, match="must be PORT or HOST:PORT"):
+        IgtlAddress.parse(text)
+
+
+def test_rounding_of_32_bits_leaves_a_point_in_the_plane():
+    c, s = math.cos(0.3), math.sin(0.3)
+    turned = np.array([[c, -s, 0, 1], [s, c, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    registration = ImageRegistration.of_matrix(turned.astype(np.float32).astype(float))
+    point = np.linalg.inv(turned) @ [40.0, 5.0, 0.0, 1.0]
+    sent = tuple(point[:3].astype(np.float32).astype(float).tolist())
+    assert to_needle(registration, sent) == (40.0, 5.0, 0.0)
