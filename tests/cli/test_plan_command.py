@@ -8,7 +8,6 @@ import pytest
 from commands import names, run
 from flexneedle.cli.common import clearance_rows
 from flexneedle.invasiveness import format_number
-from flexneedle.simulator.zones import zones_of
 from zoned import SPHERE, with_zones
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -70,9 +69,8 @@ def test_the_row_of_the_clearance_names_the_nearest_zone_with_its_margin():
     scenario = with_zones("phantom", {**SPHERE, "name": "far", "center_mm": [25.0, 30.0, 0.0]}, SPHERE)
     straight = np.pad(np.arange(-60.0, 41.0)[:, None], ((0, 0), (0, 4)))
     shapes = [straight - [30.0, 0.0, 0.0, 0.0, 0.0], straight]
-    zones = zones_of(scenario)
-    found = clearance_rows(scenario, "least", shapes)
-    assert found == {"least": f"{6.0 - zones.radius - zones.added[0]:.3f} mm to node (margin 2 mm)"}
+    found = clearance_rows(scenario, "least", 5.5, shapes)
+    assert found == {"least": "5.500 mm to node (margin 2 mm)"}
     before = [straight - [40.0, 0.0, 0.0, 0.0, 0.0]]
-    assert clearance_rows(scenario, "least", before) == {"least": "not in the tissue"}
-    assert clearance_rows(scenario.with_values({"zone": []}), "least", shapes) == {}
+    assert clearance_rows(scenario, "least", np.inf, before) == {"least": "not in the tissue"}
+    assert clearance_rows(scenario.with_values({"zone": []}), "least", np.inf, shapes) == {}

@@ -90,10 +90,9 @@ def test_a_zone_of_a_file_is_drawn_by_its_grid(tmp_path):
 def test_the_line_of_the_least_clearance_is_the_shortest_to_a_zone():
     scenario = with_zones("phantom", SPHERE)
     ax = Figure().subplots()
-    zones.draw_nearest(ax, scenario, [straight(), straight(z=3.0)], SIDE)
+    zones.draw_nearest(ax, scenario, [straight(), straight(z=3.0)], 5.59, SIDE)
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [[25.0, 0.0], [25.0, 6.0]], atol=1e-3)
-    near = 6.0 - zones_of(scenario).radius - zones_of(scenario).added[0]
-    assert ax.texts[0].get_text() == f"{near:.2f} mm"
+    assert ax.texts[0].get_text() == "5.59 mm"
 
 
 def with_clearance(scenario, insertion):

@@ -133,15 +133,17 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
-def clearance_rows(scenario: Scenario, title: str, shapes: Iterable[Floats]) -> dict[str, str]:
-    """Return the row of a table for the least clearance of shapes (n, ≥ 3) of the needle; none without zones."""
+def clearance_rows(
+    scenario: Scenario, title: str, clearance: float, shapes: Iterable[Floats]
+) -> dict[str, str]:
+    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle; none without zones."""
     import numpy as np
 
     from flexneedle.simulator.zones import zones_of
 
     if not scenario.zone:
         return {}
-    near = zones_of(scenario).nearest(np.stack(list(shapes)))
+    near = zones_of(scenario).nearest(np.stack(list(shapes)), clearance)
     if near is None:
         return {title: "not in the tissue"}
     return {title: f"{near.clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}

@@ -87,13 +87,16 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
 
 def _clearance(scenario: Scenario, insertion: Insertion) -> Iterator[tuple[str, str]]:
     """Yield the rows of the least clearance from zones: true, where the true shape is known, estimated and planned."""
+    plan = insertion.plan
     true = [period.true_shape for period in insertion.periods if period.true_shape is not None]
     shapes = [period.shape for period in insertion.periods]
     if true:
-        yield from clearance_rows(scenario, "least true clearance", true).items()
+        yield from clearance_rows(scenario, "least true clearance", insertion.true_clearance_mm, true).items()
     if shapes:
-        yield from clearance_rows(scenario, "least clearance, estimated", shapes).items()
-    yield from clearance_rows(scenario, "  planned", insertion.plan.shapes).items()
+        yield from clearance_rows(
+            scenario, "least clearance, estimated", insertion.least_clearance_mm, shapes
+        ).items()
+    yield from clearance_rows(scenario, "  planned", plan.least_clearance_mm, plan.shapes).items()
 
 
 def _invasiveness(insertion: Insertion) -> Iterator[tuple[str, str]]:

@@ -88,7 +88,7 @@ def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:
         **dict([target_row(scenario, plan.target), *entry_rows(scenario, plan)]),
         "planned tip to target": format_mm(plan.error_mm),
         f"entry angle{'s' if scenario.setup.axes > 1 else ''}": "none" if isnan(plan.entry_angle) else angles,
-        **clearance_rows(scenario, "least clearance", plan.shapes),
+        **clearance_rows(scenario, "least clearance", plan.least_clearance_mm, plan.shapes),
         **plan.invasiveness.rows(),
         "cost (mm)": f"{plan.cost:.3g}",
         **{f"  {name}": f"{value:.3g}" for name, value in plan.terms.items()},

@@ -167,6 +167,12 @@ def known_shapes(insertion: Insertion) -> list[Floats]:
     return true if complete else [period.shape for period in insertion.periods]
 
 
+def known_clearance(insertion: Insertion) -> float:
+    """Return the least clearance (mm) of the true needle from zones; if unknown, of the estimated one."""
+    true = insertion.true_clearance_mm
+    return insertion.least_clearance_mm if math.isnan(true) else true
+
+
 def last_shape(insertion: Insertion) -> Floats:
     """Return points (n, ≥ 3) of the needle at the end: true, or estimated where the true shape is not known."""
     return known_shapes(insertion)[-1]

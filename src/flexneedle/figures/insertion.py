@@ -4,7 +4,7 @@ In space the scene is two sections to the same scale, x–y and x–z, with the 
 tracker that measures its field, a panel over time shows the indicators and the times of holds.
 """
 
-from math import dist, isfinite, isnan
+from math import dist, isfinite
 from textwrap import fill
 from typing import Any
 
@@ -93,7 +93,7 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle", view)
     _paths(ax, insertion, view)
     _rolls(ax, scenario, insertion, view, 4.0)
-    zones.draw_nearest(ax, scenario, curves.known_shapes(insertion), view)
+    zones.draw_nearest(ax, scenario, curves.known_shapes(insertion), curves.known_clearance(insertion), view)
     scene.draw_target(ax, plan.target, view)
     if scenario.setup.axes == 2 and (period := curves.prediction(insertion)) is not None:
         space.draw_prediction(ax, period, view)
@@ -274,8 +274,7 @@ def _facts(insertion: Insertion) -> list[str]:
     """Return errors, bevel rolls, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     errors = [f"{name} {format_mm(value)}" for name, value in values if not np.isnan(value)]
-    true = insertion.true_clearance_mm
-    if isfinite(least := insertion.least_clearance_mm if isnan(true) else true):
+    if isfinite(least := curves.known_clearance(insertion)):
         errors.append(f"least clearance {format_mm(least)}")
     rolls = f"bevel rolls: {insertion.flips} (planned {insertion.plan.flips})"
     phantom = f"{insertion.phantom.rpartition(':')[2]} phantom" if insertion.phantom else ""

@@ -77,7 +77,7 @@ def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str, view: View)
     how: dict[str, Any] = {"color": color, "linewidth": 1.4, "zorder": 5}
     ax.plot(*plan.tips[:, view].T, "--", label=f"planned path, {plan.strategy}", **how)
     space.draw_planned(ax, scenario, plan, view, 4.0)
-    zones.draw_nearest(ax, scenario, plan.shapes, view)
+    zones.draw_nearest(ax, scenario, plan.shapes, plan.least_clearance_mm, view)
     scene.draw_target(ax, plan.target, view)
     if scenario.setup.guide_x is not None:
         travel = plan.guide[:, view[1] - Y]

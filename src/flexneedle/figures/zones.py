@@ -108,9 +108,11 @@ def _name(ax: Axes, raster: _Raster, distances: Floats, margin: float, name: str
         ax.text(*where, name, clip_on=True, zorder=8, **how).set_in_layout(False)
 
 
-def draw_nearest(ax: Axes, scenario: Scenario, shapes: Iterable[Floats], view: View) -> None:
-    """Draw a line from shapes (n, ≥ 3) of the needle to the nearest zone, with the clearance."""
-    near = zones_of(scenario).nearest(np.stack(list(shapes)))
+def draw_nearest(
+    ax: Axes, scenario: Scenario, shapes: Iterable[Floats], clearance: float, view: View
+) -> None:
+    """Draw a line from shapes (n, ≥ 3) of the needle to the nearest zone, with the clearance (mm)."""
+    near = zones_of(scenario).nearest(np.stack(list(shapes)), clearance)
     if near is None:
         return
     ends = np.array([near.needle, near.surface])[:, view]

@@ -144,8 +144,11 @@ class ZoneMap:
         """Return the least clearance (mm) of a state; infinite before the skin."""
         return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf
 
-    def nearest(self, shapes: Floats) -> "Nearest | None":
-        """Return where shapes (…, n, ≥ 3) of the needle are nearest to a zone; None if none is in tissue."""
+    def nearest(self, shapes: Floats, recorded: float = math.inf) -> "Nearest | None":
+        """Return where shapes (…, n, ≥ 3) of the needle are nearest to a zone; None if none is in tissue.
+
+        recorded: clearance (mm) of the result, known from the contacts, which are finer than shapes.
+        """
         points = self._refine(shapes).reshape(-1, 3)
         found = self.clearances(points)
         if not np.isfinite(found).any():
@@ -158,7 +161,8 @@ class ZoneMap:
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
         clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
-        return Nearest(self.names[zone], float(self.margins[zone]), clearance, here, touched)
+        shown = recorded if math.isfinite(recorded) else clearance
+        return Nearest(self.names[zone], float(self.margins[zone]), shown, here, touched)
 
 
 def zones_of(scenario: Scenario) -> ZoneMap:

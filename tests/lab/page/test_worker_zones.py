@@ -45,12 +45,12 @@ def test_a_zone_has_its_surface_and_the_one_of_its_margin():
 def test_the_nearest_zone_is_found_over_all_shapes_in_tissue():
     zones = zones_of(with_zones("phantom", SPHERE))
     straight = np.pad(np.arange(-60.0, 41.0)[:, None], ((0, 0), (0, 4)))
-    near = find_nearest(zones, [straight - [30.0, 0.0, 0.0, 0.0, 0.0], straight])
+    near = find_nearest(zones, [straight - [30.0, 0.0, 0.0, 0.0, 0.0], straight], np.inf)
     assert (near.zone, near.needle) == ("node", (25.0, 0.0, 0.0))
     assert near.surface == pytest.approx((25.0, 6.0, 0.0), abs=1e-3)
     assert near.clearance_mm == pytest.approx(6.0 - zones.radius - zones.added[0], abs=1e-6)
-    assert find_nearest(zones, [straight[:40]]) is None
-    assert find_nearest(NO_ZONES, [straight]) is None
+    assert find_nearest(zones, [straight[:40]], np.inf) is None
+    assert find_nearest(NO_ZONES, [straight], np.inf) is None
 
 
 def test_the_worker_reports_zones_of_the_scene_and_the_nearest_one_of_a_plan():

@@ -39,9 +39,9 @@ def describe_zones(scenario: Scenario, of: Literal["scene", "live", "first", "se
     return ZonesMessage(of=of, zones=described)
 
 
-def find_nearest(zones: ZoneMap, shapes: Iterable[Floats]) -> NearestZone | None:
-    """Return where shapes (n, ≥ 3) of a needle are nearest to a zone; None before the skin and without zones."""
-    near = zones.nearest(np.stack(list(shapes)))
+def find_nearest(zones: ZoneMap, shapes: Iterable[Floats], clearance: float) -> NearestZone | None:
+    """Return where shapes (n, ≥ 3) of a needle are nearest to a zone, with the clearance (mm); None before the skin."""
+    near = zones.nearest(np.stack(list(shapes)), clearance)
     if near is None:
         return None
     needle, surface = (tuple(end.round(_DIGITS).tolist()) for end in (near.needle, near.surface))
@@ -53,5 +53,5 @@ def describe_row(period: Period, plan: Plan, zones: ZoneMap) -> dict[str, Any]:
     row = page_values(period, plan)
     if not zones:
         return row
-    near = find_nearest(zones, [period.shape])
+    near = find_nearest(zones, [period.shape], period.clearance)
     return row | {"nearest": None if near is None else near.model_dump()}
