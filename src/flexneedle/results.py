@@ -160,6 +160,8 @@ class Plan:
         """One line: distance of the plan's end from the target, and the limit that binds if it misses."""
         binding = f", limited by {self.limit}" if self.limit else ""
         distance = format_mm(self.error_mm)
+        if self.intrusion_mm and self.refusal:
+            return f"ends {distance} from the target, but is {self.refusal}, limited by {self.limit}"
         if self.refusal:
             return (
                 f"ends {distance} from the target; the guard would refuse it: {self.refusal} ({self.limit})"

@@ -41,22 +41,22 @@ def test_a_stack_of_shapes_has_a_clearance_each_and_is_clear_before_the_skin():
     found = ZONES.shape_clearances(shapes)
     assert found[1] == np.inf
     assert found[2] - found[0] == pytest.approx(2.0, abs=0.05)
-    near = ZONES.nearest(shapes)
+    near = ZONES.closest(shapes)
     assert (near.zone, near.margin) == ("node", 2.0)
     assert near.clearance == found.min()
     assert np.linalg.norm(near.surface - CENTER) == pytest.approx(RADIUS, abs=1e-6)
     assert np.linalg.norm(near.surface - near.needle) == pytest.approx(
         near.clearance + ZONES.added[0] + ZONES.radius
     )
-    assert ZONES.nearest(shapes[1]) is None
-    assert NO_ZONES.nearest(shapes) is None
+    assert ZONES.closest(shapes[1]) is None
+    assert NO_ZONES.closest(shapes) is None
     assert NO_ZONES.shape_clearances(shapes).tolist() == [np.inf] * 3
 
 
 def test_the_nearest_zone_is_named_with_its_own_margin(tmp_path):
     with grid_files(tmp_path) as ring:
         zones = zones_of(with_zones("phantom3d", BOX, {**ring, "margin_mm": 0.5}))
-        near = zones.nearest(bent(2.5, lateral=1.0))
+        near = zones.closest(bent(2.5, lateral=1.0))
     assert (near.zone, near.margin) == ("ring", 0.5)
     assert zones.added[1] == pytest.approx(zones.added[0] + 0.1)
     x, y, z = near.surface

@@ -143,7 +143,7 @@ def clearance_rows(
 
     if not scenario.zone:
         return {}
-    near = zones_of(scenario).nearest(np.stack(list(shapes)), clearance)
+    near = zones_of(scenario).closest(np.stack(list(shapes)), clearance)
     if near is None:
         return {title: "not in the tissue"}
     return {title: f"{near.clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}

@@ -174,15 +174,16 @@ def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
         "As `plan.zone_weight`.",
     ),
 )  # fmt: skip
-def intrusion(trajectories: Trajectories, clear: float) -> Floats:
+def intrusion(trajectories: Trajectories, clear: float, soft: float = 0.0) -> Floats:
     """Return by how much the needle enters zones (mm), whose margin is `clear` (mm).
 
-    It is the largest intrusion (m − c)⁺ of all steps into the margin m at the clearance c, and a tenth of the mean; in
-    a zone, the depth counts again, by half.
+    It is i²/(i + `soft`), i the largest intrusion (m − c)⁺ of all steps into the margin m at the clearance c and a
+    tenth of the mean; in a zone, the depth counts again, 1.5 times.
     """
     inside = np.maximum(clear - trajectories.clearance, 0.0)
     touched = np.maximum(-trajectories.clearance, 0.0)
-    total: Floats = inside.max(axis=1) + 0.1 * inside.mean(axis=1) + 1.5 * touched.max(axis=1)
+    size = inside.max(axis=1) + 0.1 * inside.mean(axis=1)
+    total: Floats = size**2 / np.maximum(size + soft, np.finfo(float).tiny) + 1.5 * touched.max(axis=1)
     return total
 
 

@@ -112,7 +112,7 @@ def draw_nearest(
     ax: Axes, scenario: Scenario, shapes: Iterable[Floats], clearance: float, view: View
 ) -> None:
     """Draw a line from shapes (n, ≥ 3) of the needle to the nearest zone, with the clearance (mm)."""
-    near = zones_of(scenario).nearest(np.stack(list(shapes)), clearance)
+    near = zones_of(scenario).closest(np.stack(list(shapes)), clearance)
     if near is None:
         return
     ends = np.array([near.needle, near.surface])[:, view]

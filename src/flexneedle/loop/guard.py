@@ -84,8 +84,10 @@ class Guard:
 
     def _intrusion(self, state: State) -> Excess:
         """Return the excess of the least clearance permitted over the clearance."""
-        nearest = self.zones.nearest(state.body)
-        if nearest is None:
+        body = state.body
+        if not body.size:
             return Excess(-math.inf, "")
-        text = f"clearance from zone {nearest.zone} {format_mm(nearest.clearance)} < {self.buffer:g} mm"
-        return Excess(self.buffer - nearest.clearance, text, key="zone_buffer_mm")
+        found = self.zones.clearances(body)
+        zone, least = int(found.min(axis=1).argmin()), float(found.min())
+        text = f"clearance from zone {self.zones.names[zone]} {format_mm(least)} < {self.buffer:g} mm"
+        return Excess(self.buffer - least, text, key="zone_buffer_mm")

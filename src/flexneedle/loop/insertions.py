@@ -67,7 +67,7 @@ def insert(
         StoppedError: If the insertion is stopped before the first motion.
         ScenarioError: For a setting that the controller rejects.
         RunError: If the plan misses its target by more than 1 mm, unless `force` is set or the controller predicts the
-            miss itself, as the default does.
+            miss itself, as the default does; if it enters the margin of a zone, unless `force` is set.
     """
     scenario, plan = (
         load_scenario(scenario),
@@ -104,7 +104,8 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
     check_origin(plan, scenario)
     chosen = choices.controller
     check_choices(scenario, plan.strategy, choices)
-    if not (plan.reached or choices.force or chosen.predicts):
+    fails = plan.intrusion_mm or not (plan.reached or chosen.predicts)
+    if fails and not choices.force:
         missed = f"misses the target by {format_mm(plan.error_mm)} (limit {format_mm(TARGET_RADIUS_MM)}), limited by"
         why = plan.summary if plan.refusal else f"{missed} {plan.limit}"
         raise RunError(f"plan {why}; to insert anyway: flexneedle insert --force (force=True)")

@@ -22,6 +22,8 @@ from flexneedle.types import Floats
 _WAYS = 16  # that are simulated
 _RACED = 3
 _ROUNDS = 2
+_FAR_BEHIND_MM = 30.0  # cost of a way behind the best, beyond which it is not raced
+_HOPELESS_MM = 60.0  # cost of the best of a race that no other way is expected to mend: in a margin by 1 mm
 _LAPS = 6  # iterations of each in a race
 _ENTRY_SIGMA = 0.05  # of the bounds: ways are closer to their end than a first sample
 _TO_TARGET = 0.95  # correlation of point and slope, so that the path still ends near the target
@@ -49,25 +51,22 @@ def search_detours(
     search = replace(search, iterations=min(search.iterations, 2 * (search.usual or search.iterations)))
     for first in range(0, min(len(order), _ROUNDS * _RACED), _RACED):
         raced: list[Found] = []
-        for k in order[first : first + _RACED]:
+        near = costs[order] <= costs[order[first]] + _FAR_BEHIND_MM
+        for k in order[first : first + _RACED][near[first : first + _RACED]]:
             best = min((one.cost for one in raced), default=np.inf)
             shown = count_iterations(progress, done, done + search.iterations, best)
             one = find_best(variables_about(problem, z[k]), rollout, problem.terms, laps, rng, progress=shown)
             raced.append(one)
             done += one.search_state.iterations
         one = min(raced, key=lambda each: each.cost)
-        shown = count_iterations(progress, done, done + search.iterations, one.cost)
-        finished = find_best(
-            variables_about(problem, one.z),
-            rollout,
-            problem.terms,
-            search,
-            rng,
-            progress=shown,
-            begun=one.search_state,
-        )
-        done += finished.search_state.iterations
-        yield make_solution(problem, finished)
+        if not one.search_state.converged:
+            shown = count_iterations(progress, done, done + search.iterations, one.cost)
+            about, begun = variables_about(problem, one.z), one.search_state
+            one = find_best(about, rollout, problem.terms, search, rng, progress=shown, begun=begun)
+            done += one.search_state.iterations
+        yield make_solution(problem, one)
+        if one.cost > _HOPELESS_MM:
+            return
 
 
 def variables_about(problem: PlanProblem, z: Floats) -> Variables:

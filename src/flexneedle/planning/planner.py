@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.detours import search_detours
 from flexneedle.planning.entry import mounted_axes, with_entry
 from flexneedle.planning.events import Iterated, Listener, send_event
+from flexneedle.planning.freedom import find_freedom
 from flexneedle.planning.horizon import OnIteration, count_iterations
 from flexneedle.planning.limit import find_largest_load, find_limit
 from flexneedle.planning.primitives import Solution, fix_guide, search_primitives, widen_search
@@ -43,6 +43,7 @@ _PRECISE_MM = 0.1  # miss of a plan above which other searches are made
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
 _RESERVE_MM = 0.1  # of clearance in a search, beyond the margin
+_OVERLOAD_MM = 10.0  # rank of a load beyond a limit of the guard
 _OUTPUTS = ("energy", "stretch", "strain", "loads", "shapes", "clearance")
 _ENOUGH_ROLLS = 1  # to reach a target, though not at the least cost
 
@@ -110,18 +111,18 @@ def _avoid(
     rng: np.random.Generator,
     progress: OnIteration,
 ) -> Plan:
-    """Return the first plan that keeps the margins and reaches the target; of others, the best."""
+    """Return the first plan that keeps all margins and reaches the target; of others, the best with what it lacks."""
     plan, needle = simulator.scenario.plan, simulator.scenario.needle
     around = replace(problem, clear=zones.margin + _RESERVE_MM, length=needle.length_mm)
-    after = count_iterations(progress, found.iterations, found.iterations + plan.iterations, np.inf)
+    shapes_of, room = _make_rollout(simulator, (), at_end=("shapes",)), _make_room(simulator.scenario, zones)
     solutions = search_detours(
         _make_rollout(simulator, around.terms),
-        _make_rollout(simulator, (), at_end=("shapes",)),
+        shapes_of,
         around,
-        _make_room(simulator.scenario, zones),
+        room,
         _search_settings(plan, plan.samples),
         rng,
-        after,
+        count_iterations(progress, found.iterations, found.iterations + plan.iterations, np.inf),
     )
     best, history = found, found.history
     for solution in solutions:
@@ -130,13 +131,18 @@ def _avoid(
         best = min(best, new, key=_rank)
         if best.hit and not best.intrusion_mm and best.error_mm <= _PRECISE_MM:
             break
-    return replace(best, history=history, iterations=len(history))
+    best = replace(best, history=history, iterations=len(history))
+    if best.hit:
+        return best
+    help_by = find_freedom(shapes_of, around, room)
+    margin = f"zones.margin_mm = {zones.margin:g}"
+    return replace(best, limit=f"{margin}; {help_by} may suffice" if help_by else margin)
 
 
 def _rank(plan: Plan) -> tuple[float, float]:
     """Return the order of plans: by the intrusion into margins (mm) and the miss beyond what is precise, then cost."""
     off = plan.intrusion_mm + max(0.0, plan.error_mm - _PRECISE_MM)
-    return (off + (10.0 if plan.refusal else 0.0), plan.cost)
+    return off + _OVERLOAD_MM * plan.limit.startswith("guard."), plan.cost
 
 
 def _other_searches(problem: PlanProblem) -> tuple[Callable[[PlanProblem], PlanProblem], ...]:
@@ -235,7 +241,7 @@ def _carry_out(
     start = simulator.start(solution.roll)
     steps = simulator.rollout(start, rows[None], outputs=_OUTPUTS)
     load, end = find_largest_load(problem.loads, simulator, start, steps), steps.tips[0, -1]
-    return Plan(
+    plan = Plan(
         strategy=strategy,
         target=goal,
         seed=seed,
@@ -256,24 +262,30 @@ def _carry_out(
         refusal=load.text if load.share > 1.0 else "",
         least_stretch=np.append(start.least_stretch, steps.stretch[0]),
         scenario=simulator.scenario,
-        **_measure_clearance(simulator, start, rows, steps),
     )
+    return _measure_clearance(plan, simulator, start, steps.clearance[0])
 
 
-def _measure_clearance(
-    simulator: Simulator, start: State, rows: Floats, steps: Trajectories
-) -> dict[str, Any]:
-    """Return clearance and intrusion of a plan from its controls (m, 9) and their rollout (N = 1)."""
+def _measure_clearance(plan: Plan, simulator: Simulator, start: State, searched: Floats) -> Plan:
+    """Return a plan with its clearance, and with a refusal if it enters a margin.
+
+    searched (m,): clearance after each step, as a search compares it.
+    """
     zones = zones_of(simulator.scenario)
-    clearance = np.full(len(rows) + 1, np.inf)
-    if zones:
-        clearance[1:] = (
-            simulator.with_zones(zones.exact).rollout(start, rows[None], outputs="clearance").clearance
-        )
-        # Before the skin, and beyond `far`, it is a large number.
-        clearance[clearance > zones.exact.far - 2.0 * zones.radius] = np.inf
-    intrusion = zones.margin - steps.clearance.min(initial=np.inf)
-    return {"clearance": clearance, "intrusion_mm": max(0.0, float(intrusion))}
+    if not zones:
+        return replace(plan, clearance=np.full(len(plan.tips), np.inf))
+    exact = (
+        simulator.with_zones(zones.exact).rollout(start, plan.controls[None], outputs="clearance").clearance
+    )
+    clearance = np.append(np.inf, np.where(plan.tips[1:, X] > 0.0, exact[0], np.inf))
+    intrusion, worst = max(0.0, zones.margin - float(searched.min())), int(searched.argmin())
+    plan = replace(plan, clearance=clearance, intrusion_mm=intrusion)
+    if not intrusion or plan.refusal:
+        return plan
+    near = zones.nearest(simulator.replay(start, plan.controls[: worst + 1])[0].body)
+    where = "from" if near.clearance >= 0.0 else "inside"
+    refusal = f"{format_mm(abs(near.clearance))} {where} zone {near.zone} (margin {near.margin:g} mm)"
+    return replace(plan, refusal=refusal, limit=f"zones.margin_mm = {zones.margin:g}")
 
 
 def _fix_entry(

@@ -9,8 +9,10 @@ clearance and, by the distance of the needle from the path that it has cut, the 
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.costs.terms import SHARE_OF_LIMIT
 from flexneedle.costs.weighted_sum import RolloutFunction
@@ -78,15 +80,15 @@ def find_ways(
 
     Entries are on a grid, the guide's motions random. rollout: with the shapes at the end.
     """
-    responses = _Responses.of(rollout, problem)
+    responses = Responses.of(rollout, problem)
     found = [responses.at_entries()]
     if responses.columns:
-        found.append(responses.with_guide(found[0], _rate(problem, found[0], room), rng))
-    rated = [(way, _rate(problem, way, room)) for way in found]
+        found.append(responses.with_guide(found[0], rate(problem, found[0], room), rng))
+    rated = [(way, rate(problem, way, room)) for way in found]
     return _choose(rated, count)
 
 
-def _rate(problem: PlanProblem, ways: Ways, room: Room) -> Floats:
+def rate(problem: PlanProblem, ways: Ways, room: Room) -> Floats:
     """Return costs (N,), mm: intrusion into margins, miss, loads of tissue and needle."""
     inside = np.stack(
         [_intrusion(problem, ways.depths, each, room) for each in (ways.paths, ways.bodies)]
@@ -121,8 +123,16 @@ def _choose(rated: list[tuple[Ways, Floats]], count: int) -> Floats:
     return z[chosen]
 
 
+class Entries(NamedTuple):
+    """N entries: pattern of rolls, change of the point y + iz (mm) and of the slope (rad)."""
+
+    pattern: NDArray[np.intp]
+    point: Laterals
+    slope: Laterals
+
+
 @dataclass(frozen=True, eq=False)
-class _Responses:
+class Responses:
     """Rollouts of which paths are superposed.
 
     patterns: insertions with rolls alone; columns (J,): coordinates of the guide's motions; guide: changes of path and
@@ -136,7 +146,7 @@ class _Responses:
     scale: Floats
 
     @staticmethod
-    def of(rollout: RolloutFunction, problem: PlanProblem) -> "_Responses":
+    def of(rollout: RolloutFunction, problem: PlanProblem) -> "Responses":
         """Return the responses by a rollout of each."""
         z = _patterns(problem)
         columns, scale = _guide_coordinates(problem)
@@ -155,30 +165,40 @@ class _Responses:
             (guide.bends - both.bends[0]) / one,
             depths,
         )
-        return _Responses(problem, both.take(slice(len(z))), columns, changes, scale)
+        return Responses(problem, both.take(slice(len(z))), columns, changes, scale)
 
     def at_entries(self) -> Ways:
         """Return paths with each pattern to the target, from entries of a grid of slopes."""
-        problem, ways = self.problem, self.patterns
+        problem = self.problem
         radius, most = problem.entry
+        entries = self.spread_entries(most)
+        size = np.abs(entries.point)
+        kept = size <= radius if (size <= radius).any() else np.ones_like(size, dtype=bool)
+        point = entries.point * np.minimum(1.0, radius / np.maximum(size, np.finfo(float).tiny))
+        return self.enter(entries.pattern[kept], point[kept], entries.slope[kept])
+
+    def spread_entries(self, most: float) -> Entries:
+        """Return entries with changes of the slope up to `most` (rad) from which each pattern ends at the target."""
+        problem = self.problem
         slopes = _disc(_SLOPES[problem.axes] if most else 1, most, problem.axes)
         steep = slopes + problem.slope
         slopes = slopes[np.maximum(np.abs(steep.real), np.abs(steep.imag)) <= problem.steepest]
-        point = complex(*problem.target[1:]) - ways.paths[:, -1:] - slopes * problem.target[0]  # (K, S)
-        size = np.abs(point)
-        kept = size <= radius if (size <= radius).any() else np.ones_like(size, dtype=bool)
-        point = point * np.minimum(1.0, radius / np.maximum(size, np.finfo(float).tiny))
-        pattern, slope = np.nonzero(kept)
-        point, change = point[kept], slopes[slope]
-        line = point[:, None] + change[:, None] * ways.depths
+        ends = self.patterns.paths[:, -1:] + slopes * problem.target[0]  # (K, S)
+        pattern = np.broadcast_to(np.arange(len(ends))[:, None], ends.shape)
+        point = complex(*problem.target[1:]) - ends
+        return Entries(pattern.ravel(), point.ravel(), np.broadcast_to(slopes, ends.shape).ravel())
+
+    def enter(self, pattern: NDArray[np.intp], point: Laterals, slope: Laterals) -> Ways:
+        """Return paths of patterns (N,) from an entry changed by `point` (N,), mm, and `slope` (N,)."""
+        problem, ways = self.problem, self.patterns
+        line = point[:, None] + slope[:, None] * ways.depths
         z = ways.z[pattern]
         if problem.entry_coordinates:
-            own = np.stack([point, change], axis=1) / problem.frame
+            own = np.stack([point, slope], axis=1) / problem.frame
             parts = [own.real] if problem.axes == 1 else [own.real, own.imag]
             z[:, -problem.entry_coordinates :] = np.stack(parts, axis=2).reshape(len(z), -1)
-        return Ways(
-            z, ways.paths[pattern] + line, ways.bodies[pattern] + line, ways.bends[pattern], ways.depths
-        )
+        paths, bodies = ways.paths[pattern] + line, ways.bodies[pattern] + line
+        return Ways(z, paths, bodies, ways.bends[pattern], ways.depths)
 
     def with_guide(self, ways: Ways, costs: Floats, rng: np.random.Generator) -> Ways:
         """Return the best of ways with random motions of the guide, by which they end at the target as well."""

@@ -62,11 +62,14 @@ class DistanceGrid(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """The nearest zone: name, margin and clearance (mm), and the nearest points (3,) of needle's axis and zone."""
+    """Where a needle is nearest to a zone, or deepest in its margin.
+
+    zone: its name; clearance and margin: mm; needle, surface (3,): points of axis and zone.
+    """
 
     zone: str
-    margin: float
     clearance: float
+    margin: float
     needle: Floats
     surface: Floats
 
@@ -144,8 +147,17 @@ class ZoneMap:
         """Return the least clearance (mm) of a state; infinite before the skin."""
         return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf
 
-    def nearest(self, shapes: Floats, recorded: float = math.inf) -> "Nearest | None":
-        """Return where shapes (…, n, ≥ 3) of the needle are nearest to a zone; None if none is in tissue.
+    def nearest(self, points: Floats) -> "Nearest":
+        """Return where points (n, 3) of the needle's axis, of which one at least is in tissue, are nearest to a zone.
+
+        Zones are compared by clearance less margin.
+        """
+        found = self.clearances(points)
+        zone, at = np.unravel_index(int((found - self.margins[:, None]).argmin()), found.shape)
+        return self._nearest(int(zone), points[at], float(found[zone, at]))
+
+    def closest(self, shapes: Floats, recorded: float = math.inf) -> "Nearest | None":
+        """Return where shapes (…, n, ≥ 3) of the needle have their least clearance; None if none is in tissue.
 
         recorded: clearance (mm) of the result, known from the contacts, which are finer than shapes.
         """
@@ -154,15 +166,17 @@ class ZoneMap:
         if not np.isfinite(found).any():
             return None
         zone, at = np.unravel_index(int(found.argmin()), found.shape)
-        here = points[at]
+        near = self._nearest(int(zone), points[at], float(found[zone, at]))
+        return near._replace(clearance=recorded) if math.isfinite(recorded) else near
+
+    def _nearest(self, zone: int, here: Floats, clearance: float) -> "Nearest":
+        """Return a point (3,) of the axis, its clearance (mm) from a zone, and the point of the zone."""
         ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
         around = np.empty((len(self.names), 6))
         kernels.fill_distances(self.exact, ends, around)
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
-        clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
-        shown = recorded if math.isfinite(recorded) else clearance
-        return Nearest(self.names[zone], float(self.margins[zone]), shown, here, touched)
+        return Nearest(self.names[zone], clearance, float(self.margins[zone]), here, touched)
 
 
 def zones_of(scenario: Scenario) -> ZoneMap:

@@ -66,6 +66,8 @@ _MORE_ALONE = 2  # factor on the samples with the bevel alone
 _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
 # Cost of a motion of the guide, with the energy in its wake, over the charge on travel.
 _PRICE_OF_ENERGY = 2.0
+# Intrusion into a margin up to which it is charged little: the estimate moves by about as much from period to period.
+_SOFT_MM = 0.1
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -280,6 +282,7 @@ def cost_terms(
         expected=expected,
         angle=angle,
         clear=memory.clear or 0.0,
+        soft=_SOFT_MM,
         **reserve._asdict(),
         **memory.loads.values,
     )

@@ -27,7 +27,7 @@ def _surfaces(scenario: Scenario, zones: ZoneMap) -> Iterator[ZoneSurface]:
 
 def make_clearance(zones: ZoneMap, period: Period) -> RosClearance | None:
     """Return the least clearance of the estimated needle of a period; None before the skin and without zones."""
-    near = zones.nearest(period.shape, period.clearance)
+    near = zones.closest(period.shape, period.clearance)
     if near is None:
         return None
     return RosClearance(period.time, near.zone, near.clearance, _point(near.needle), _point(near.surface))

@@ -41,7 +41,7 @@ def describe_zones(scenario: Scenario, of: Literal["scene", "live", "first", "se
 
 def find_nearest(zones: ZoneMap, shapes: Iterable[Floats], clearance: float) -> NearestZone | None:
     """Return where shapes (n, ≥ 3) of a needle are nearest to a zone, with the clearance (mm); None before the skin."""
-    near = zones.nearest(np.stack(list(shapes)), clearance)
+    near = zones.closest(np.stack(list(shapes)), clearance)
     if near is None:
         return None
     needle, surface = (tuple(end.round(_DIGITS).tolist()) for end in (near.needle, near.surface))

@@ -1,0 +1,43 @@
+"""What would let a plan keep clear of all zones: a larger entry disc, a larger angle, or a smaller margin."""
+
+import numpy as np
+
+from flexneedle.costs.weighted_sum import RolloutFunction
+from flexneedle.planning.problem import PlanProblem
+from flexneedle.planning.ways import Responses, Room, rate
+from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
+from flexneedle.types import Floats
+
+_RADIUS_MM = 40.0  # of the largest disc that is considered
+_CLEAR_MM = 0.2  # rating of a way that is clear
+
+
+def find_freedom(rollout: RolloutFunction, problem: PlanProblem, room: Room) -> str:
+    """Return the settings, one of which suffices by an estimate; "" if none is found.
+
+    Of ways without the guide's motion from any entry; rollout: with the shapes at the end.
+    """
+    responses = Responses.of(rollout, problem)
+    entries = responses.spread_entries(1e-3 * STEEPEST_MRAD)
+    near = np.abs(entries.point) <= max(_RADIUS_MM, problem.entry[0])
+    point, slope = entries.point[near], entries.slope[near]
+    clear = rate(problem, responses.enter(entries.pattern[near], point, slope), room) <= _CLEAR_MM
+    radius, angle = problem.entry
+    off, turn = np.abs(point), np.abs(slope)
+    found = [
+        _least("entry.free_radius_mm", off[clear & (turn <= angle)]),
+        _least("entry.free_slope_mrad", 1e3 * turn[clear & (off <= radius)]),
+    ]
+    if not any(found) and clear.any():
+        best = np.flatnonzero(clear)[(off[clear] / _RADIUS_MM + turn[clear]).argmin()]
+        both = (
+            _least("entry.free_radius_mm", off[[best]]),
+            _least("entry.free_slope_mrad", 1e3 * turn[[best]]),
+        )
+        found = [" with ".join(both)]
+    return " or ".join(filter(None, found))
+
+
+def _least(key: str, values: Floats) -> str:
+    """Return a key with the least of values, rounded up; "" without values."""
+    return f"{key} = {np.ceil(values.min()):g}" if values.size else ""
