@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from flexneedle.record.folder import Folder
     from flexneedle.results import Plan
     from flexneedle.scenario.model import Scenario
+    from flexneedle.types import Floats
 
 _TABLE_WIDTH = 200  # characters: a line that is wrapped in a table would split numbers
 
@@ -137,6 +138,22 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
         ("chosen entry, lateral", f"{', '.join(f'{value:.2f}' for value in point)} mm"),
         ("  slope of the axis", f"{', '.join(f'{value:.1f}' for value in slope)} mrad"),
     ]
+
+
+def clearance_rows(
+    scenario: Scenario, title: str, clearance: float, shapes: Iterable[Floats]
+) -> dict[str, str]:
+    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle; none without zones."""
+    import numpy as np
+
+    from flexneedle.simulator.zones import zones_of
+
+    if not scenario.zone:
+        return {}
+    near = zones_of(scenario).closest(np.stack(list(shapes)), clearance)
+    if near is None:
+        return {title: "not in the tissue"}
+    return {title: f"{near.clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}
 
 
 def compile_first(*axes: int, phantoms: bool = True) -> None:
