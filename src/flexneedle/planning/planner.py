@@ -92,16 +92,15 @@ def plan(
 def search_plan(simulator: Simulator, goal: Point, strategy: str, seed: int, progress: OnIteration) -> Plan:
     """Return the plan from the simulator's start to the goal (mm), as `plan` does, for a simulator of any needle."""
     scenario, rng = simulator.scenario, np.random.default_rng(seed)
-    problem = make_problem(scenario, goal, strategy)
-    found = _carry_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
+    problem, zones = make_problem(scenario, goal, strategy), zones_of(scenario)
+    found = _carry_out(simulator, problem, zones, strategy, seed, _search(simulator, problem, rng, progress))
     for change in _other_searches(problem):
         if found.error_mm <= _PRECISE_MM:
             break
         usual = found.iterations + scenario.plan.iterations
         after = count_iterations(progress, found.iterations, usual, found.cost)
         again = _search(simulator, change(problem), rng, after)
-        found = _choose_better(found, _carry_out(simulator, problem, strategy, seed, again))
-    zones = zones_of(scenario)
+        found = _choose_better(found, _carry_out(simulator, problem, zones, strategy, seed, again))
     if not found.intrusion_mm:
         return found
     return _avoid(simulator, problem, zones, found, rng, progress)
@@ -125,7 +124,7 @@ def _avoid(
     best, history = found, found.history
     for solution in solutions:
         for repeat in range(1 + _REPEATS):
-            new = _carry_out(simulator, problem, found.strategy, found.seed, solution)
+            new = _carry_out(simulator, problem, zones, found.strategy, found.seed, solution)
             history = (*history, *new.history)
             best = min(best, new, key=_rank)
             near = 0.0 < new.intrusion_mm <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
@@ -236,7 +235,7 @@ def _cost_as_carried_out(plan: Plan) -> float:
 
 
 def _carry_out(
-    simulator: Simulator, problem: PlanProblem, strategy: str, seed: int, solution: Solution
+    simulator: Simulator, problem: PlanProblem, zones: ZoneMap, strategy: str, seed: int, solution: Solution
 ) -> Plan:
     """Return the plan that ends at the target's depth, with its entry in the scenario if that was free."""
     simulator, problem = _fix_entry(simulator, problem, solution, strategy)
@@ -267,16 +266,18 @@ def _carry_out(
         least_stretch=np.append(start.least_stretch, steps.stretch[0]),
         scenario=simulator.scenario,
     )
-    return _measure_clearance(plan, simulator, start, steps.clearance[0])
+    return _measure_clearance(plan, simulator, zones, start, steps.clearance[0])
 
 
-def _measure_clearance(plan: Plan, simulator: Simulator, start: State, searched: Floats) -> Plan:
+def _measure_clearance(
+    plan: Plan, simulator: Simulator, zones: ZoneMap, start: State, searched: Floats
+) -> Plan:
     """Return a plan with its clearance by the simulator and by the exact rod, and with a refusal if it enters a margin.
 
     searched (m,): clearance after each step, as a search compares it.
     """
     scenario, rows = simulator.scenario, plan.controls
-    if not (zones := zones_of(scenario)):
+    if not zones:
         return replace(plan, clearance=np.full(len(plan.tips), np.inf))
     least = simulator.with_zones(zones.exact).rollout(start, rows[None], outputs="clearance").clearance[0]
     inside = zones.margin - float(searched.min())
@@ -309,7 +310,8 @@ def _fix_entry(
     if not simulator.scenario.entry.free:
         return simulator, problem
     scenario = with_entry(simulator.scenario, *solution.entry)
-    return Simulator(scenario, simulator.threads), make_problem(scenario, problem.target, strategy)
+    fixed = Simulator(scenario, simulator.threads, zones=simulator.zones)  # whose zones are read already
+    return fixed, make_problem(scenario, problem.target, strategy)
 
 
 def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:
