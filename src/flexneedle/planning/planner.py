@@ -114,7 +114,7 @@ def _avoid(
     """Return the first plan that keeps all margins and reaches the target; of others, the best with what it lacks."""
     plan, needle = simulator.scenario.plan, simulator.scenario.needle
     around = replace(problem, clear=zones.margin + _RESERVE_MM, length=needle.length_mm)
-    shapes_of, room = _make_rollout(simulator, (), at_end=("shapes",)), _make_room(simulator.scenario, zones)
+    shapes_of, room = _make_rollout(simulator, (), at_end=("shapes",)), make_room(simulator.scenario, zones)
     solutions = search_detours(
         _make_rollout(simulator, around.terms),
         shapes_of,
@@ -322,7 +322,7 @@ def _search(
     return search_primitives(rollout, problem, _search_settings(plan, plan.samples), rng, progress)
 
 
-def _make_room(scenario: Scenario, zones: ZoneMap) -> Room:
+def make_room(scenario: Scenario, zones: ZoneMap) -> Room:
     """Return what first paths are judged by."""
     curvature = 2.0 * LoadLimits.of(scenario).strain / scenario.needle.outer_diameter
     return Room(zones.least_clearances, partial(_compression_lengths, scenario), curvature)

@@ -1,0 +1,349 @@
+"""Maps of entry points: from which the target is reached, with what clearance, load and tolerance.
+
+Each entry gets the slope and the pattern of rolls that suit it best, without motion of the guide: first by superposition
+(`planning.ways`), of which the best few are carried out, with the slope corrected by the miss.
+"""
+
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.costs.weighted_sum import Trajectories
+from flexneedle.errors import InputError
+from flexneedle.invasiveness import Invasiveness
+from flexneedle.mechanics.zones import MORE, Zones
+from flexneedle.planning.entry import add_along, read_entry, with_entry
+from flexneedle.planning.planner import make_room
+from flexneedle.planning.primitives import make_controls
+from flexneedle.planning.problem import ROUNDING, PlanProblem, make_problem
+from flexneedle.planning.tolerance import find_angles, find_offsets
+from flexneedle.planning.ways import Responses, rate
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.zones import ZoneMap, zones_of
+from flexneedle.types import DB_X, DB_Z, PSI, ROLL, THETA, Flags, Floats, Laterals, X, Y, Z, across
+
+Whole = NDArray[np.intp]
+PRECISE_MM = 0.1
+"""Largest distance from the target at which an entry reaches it."""
+_COUNTS = {1: 121, 2: 600}  # of entries, about, by the number of axes
+_TRIED = 3  # patterns of each entry that are carried out
+_ROUNDS = 3  # of corrections
+_RESERVE_MM = 0.9  # of clearance beyond the margin that superposed paths are charged for
+_MOMENTS = (0.3, 0.5, 0.7, 0.85)  # shares of the depth at which the needle's shape is in a path
+_ROOM_MM = 0.1  # in which rooms are equal
+_FAR_MM = 1e3
+_APART = 0.25  # of the disc's radius, of entries that are distinct
+
+
+@dataclass(frozen=True, eq=False)
+class EntryMap:
+    """Entry points of a scenario, E of them, each with the best insertion to the target that was found for it.
+
+    Attributes:
+        scenario: The scenario, with a free entry.
+        points: y, z of the entry points on the skin (E, 2), mm.
+        slopes: Slopes dy/dx, dz/dx of the axis (E, 2), rad.
+        reached: Whether the target is reached (E,), within 0.1 mm, from the entry with a slope that is free, and with
+            loads that the guard permits.
+        clear: Whether it is reached with all margins of zones kept (E,).
+        error_mm: Distance of the tip from the target at the end (E,).
+        clearance_mm: Least clearance of the inserted needle from the zones over the insertion (E,), a bound; infinite
+            without zones.
+        zone: Number of the zone that is nearest, by clearance less margin (E,); −1 without zones.
+        length_mm: Length of the needle in the tissue at the end (E,).
+        peak_energy_uj, mean_energy_uj: Energy stored in the tissue (E,), as in `Invasiveness`.
+        offset_mm: By how much the inserted needle may be displaced along y, and z, in any direction, before it enters
+            a margin (E,); a lower bound; 0 where not clear.
+        angle_mrad: By how much it may be turned about the entry point (E,), likewise.
+        rolls: Angle of the needle before the first step (E,), rad.
+        controls: Columns of `Control` (E, m, 9), from the needle at its entry; steps at the end may be 0.
+    """
+
+    scenario: Scenario
+    points: Floats
+    slopes: Floats
+    reached: Flags
+    clear: Flags
+    error_mm: Floats
+    clearance_mm: Floats
+    zone: Whole
+    length_mm: Floats
+    peak_energy_uj: Floats
+    mean_energy_uj: Floats
+    offset_mm: Floats
+    angle_mrad: Floats
+    rolls: Floats
+    controls: Floats
+
+    @property
+    def room_mm(self) -> Floats:
+        """Tolerance of each entry as a length (E,): of its offset, or of its angle times the length, the smaller."""
+        room: Floats = np.minimum(self.offset_mm, 1e-3 * self.angle_mrad * self.length_mm)
+        return room
+
+    @property
+    def order(self) -> Whole:
+        """Entries from the best: reached and clear, then with the larger room, then with less peak energy.
+
+        Of entries that are not clear, those with the larger clearance are first. Rooms within 0.1 mm are equal.
+        """
+        room = np.where(self.clear, np.round(self.room_mm / _ROOM_MM), np.minimum(self.clearance_mm, 0.0))
+        return np.lexsort((self.peak_energy_uj, -room, ~self.clear, ~self.reached))
+
+    def best(self, count: int) -> list[int]:
+        """Return up to `count` clear entries, from the best, at least a quarter of the disc's radius apart."""
+        least, chosen = _APART * self.scenario.entry.free_radius_mm, list[int]()
+        for k in self.order[self.clear[self.order]].tolist():
+            if len(chosen) < count and all(
+                np.linalg.norm(self.points[k] - self.points[other]) >= least for other in chosen
+            ):
+                chosen.append(k)
+        return chosen
+
+    def scenario_at(self, entry: int) -> Scenario:
+        """Return the scenario with its entry fixed at one of the map."""
+        own = self.scenario.entry
+        (y, z), slope = self.points[entry].tolist(), complex(*self.slopes[entry])
+        return with_entry(self.scenario, complex(y, z) - own.lateral(0.0), slope - own.slope)
+
+    def take(self, which: Whole) -> "EntryMap":
+        """Return the map of some entries."""
+        return EntryMap(self.scenario, *(getattr(self, each.name)[which] for each in fields(self)[1:]))
+
+
+def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) -> EntryMap:
+    """Return the map of the free entry points of a scenario. The same scenario has the same map.
+
+    Args:
+        scenario: A scenario, its name or its path, as for `load_scenario`.
+        threads: Threads of rollouts (default: all cores), without effect on the result.
+
+    Raises:
+        InputError: Point or slope of the entry are fixed, or a zone's file cannot be used.
+    """
+    scenario = load_scenario(scenario)
+    for key in ("free_radius_mm", "free_slope_mrad"):
+        if not getattr(scenario.entry, key):
+            raise InputError(f"entry.{key} = 0: must be above 0 for a map of entries, on which it is free")
+    zones, simulator = zones_of(scenario), Simulator(scenario, threads)
+    usual = make_problem(scenario, scenario.target.position, "steering")
+    problem = replace(usual, clear=zones.margin + _RESERVE_MM, length=scenario.needle.length_mm)
+    z, number = _superpose(simulator, problem, zones)
+    found = _carry_out(simulator, problem, zones, *_correct(simulator, problem, z))
+    order = found.order
+    _, first = np.unique(number[order], return_index=True)
+    return found.take(order[first])
+
+
+def _superpose(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> tuple[Floats, Whole]:
+    """Return coordinates (N, d) of the best paths from each entry, and the numbers (N,) of their entries."""
+    start = simulator.start()
+
+    def rollout(controls: Floats) -> Trajectories:
+        return simulator.rollout(start, controls, at_end=("shapes",), limits=False)
+
+    responses, point = Responses.of(rollout, problem), _grid(problem)
+    ends = responses.patterns.paths[:, -1]
+    slope = (complex(*problem.target[1:]) - ends - point[:, None]) / problem.target[0]
+    slope *= np.minimum(1.0, problem.entry[1] / np.maximum(np.abs(slope), np.finfo(float).tiny))
+    entry, pattern = np.indices(slope.shape)
+    ways = responses.enter(pattern.ravel(), point[entry.ravel()], slope.ravel())
+    costs = rate(problem, ways, make_room(simulator.scenario, zones)).reshape(slope.shape)
+    best = np.argsort(costs, axis=1, kind="stable")[:, :_TRIED]
+    chosen = np.arange(len(point))[:, None] * slope.shape[1] + best
+    return ways.z[chosen.ravel()], np.repeat(np.arange(len(point)), best.shape[1])
+
+
+def _grid(problem: PlanProblem) -> Laterals:
+    """Return changes (E,) of the entry point: along y in the plane, on a grid of triangles in the disc in space."""
+    radius, count = problem.entry[0], _COUNTS[problem.axes]
+    if problem.axes == 1:
+        return np.linspace(-radius, radius, count) + 0j
+    spacing = radius * np.sqrt(2.0 * np.pi / (np.sqrt(3.0) * count))
+    most = int(np.ceil(2.0 * radius / spacing))
+    a, b = np.meshgrid(*[np.arange(-most, most + 1)] * 2)
+    points: Laterals = spacing * (a + np.exp(1j * np.pi / 3.0) * b).ravel()
+    return points[np.abs(points) <= radius]
+
+
+def _correct(simulator: Simulator, problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
+    """Return controls (N, m, 9) that end at the target's depth, and z (N, d) with slopes changed by the misses."""
+    first = z.shape[1] - problem.entry_coordinates + problem.axes
+    z, more, start = z.copy(), np.zeros(len(z)), simulator.start()
+    for _ in range(_ROUNDS):
+        rows = _lengthen(problem, make_controls(problem, z)[0], more)
+        ends = simulator.rollout(start, rows, limits=False).tips[:, -1]
+        short = problem.target[0] - ends[:, X]
+        at_depth = across(ends, Y) + (np.tan(ends[:, THETA]) + 1j * np.tan(ends[:, PSI])) * short
+        turn = (complex(*problem.target[1:]) - at_depth) / (problem.target[0] * problem.frame)
+        z[:, first] += turn.real
+        if problem.axes == 2:
+            z[:, first + 1] += turn.imag
+        more += short
+    return _lengthen(problem, make_controls(problem, z)[0], more), z
+
+
+def _lengthen(problem: PlanProblem, rows: Floats, more: Floats) -> Floats:
+    """Return controls (N, m, 9) with a last advance that is longer by `more` (N,), mm, within the stroke."""
+    travel = rows[:, :, DB_X].sum(axis=1)
+    each, last = np.arange(len(rows)), rows.shape[1] - 1 - np.argmax(rows[:, ::-1, DB_X] > 0.0, axis=1)
+    advance = rows[each, last, DB_X]
+    wanted = np.maximum(advance + np.minimum(more, problem.reach[0] - travel), 0.0)
+    rows[each, last, DB_X : DB_Z + 1] *= (wanted / advance)[:, None]
+    return rows
+
+
+def _carry_out(
+    simulator: Simulator, problem: PlanProblem, zones: ZoneMap, rows: Floats, z: Floats
+) -> EntryMap:
+    """Return the map of insertions by controls (N, m, 9) with coordinates z (N, d)."""
+    outputs = ("energy", "stretch", "strain", "shapes")
+    done = simulator.rollout(simulator.start(), rows, outputs=outputs, limits=False)
+    point, slope = read_entry(problem, z[:, z.shape[1] - problem.entry_coordinates :])
+    error = np.linalg.norm(done.tips[:, -1, : Z + 1] - problem.target, axis=1)
+    is_free = np.abs(point - _entry_point(problem, z)) <= ROUNDING
+    reached = (error <= PRECISE_MM) & is_free & _is_permitted(problem, done)
+    mounted = rows[:, 1:].copy()
+    add_along(mounted, -slope)
+    entry, energies = simulator.scenario.entry, _energies(simulator, problem, done)
+    return EntryMap(
+        simulator.scenario,
+        _parts(point + entry.lateral(0.0)),
+        _parts(slope + entry.slope),
+        reached,
+        error_mm=error,
+        **_measure_clearance(simulator, zones, done, reached),
+        length_mm=_lengths(done),
+        peak_energy_uj=energies[:, 0],
+        mean_energy_uj=energies[:, 1],
+        rolls=rows[:, 0, ROLL],
+        controls=mounted,
+    )
+
+
+def _entry_point(problem: PlanProblem, z: Floats) -> Laterals:
+    """Return the changes (N,) of the entry point, mm, that coordinates z (N, d) want, which limits may move."""
+    wanted = z[:, z.shape[1] - problem.entry_coordinates :]
+    point: Laterals = problem.frame * (wanted[:, 0] + (1j * wanted[:, 1] if problem.axes == 2 else 0.0))
+    return point
+
+
+def _is_permitted(problem: PlanProblem, done: Trajectories) -> Flags:
+    """Return whether loads of needle and tissue (N,) are within the limits of the guard."""
+    limits = problem.loads.values
+    strained = done.strain.max(axis=1) > limits["strain"]
+    return ~strained & (1.0 - done.stretch.min(axis=1) <= limits["compression"]) & done.converged.all(axis=1)
+
+
+def _energies(simulator: Simulator, problem: PlanProblem, done: Trajectories) -> Floats:
+    """Return peak and mean energy (N, 2), µJ."""
+    start, still = simulator.start(), np.zeros((done.tips.shape[1], 2))
+    found = []
+    for tips, energy, stretch in zip(done.tips, done.energy, done.stretch, strict=True):
+        depth = np.append(start.tip[X], tips[:, X])
+        load = Invasiveness.measure(
+            depth,
+            np.append(start.strain_energy, energy),
+            scale=problem.energy_scale,
+            stretch=stretch,
+            guide_steps=still,
+            rolls=0,
+        )
+        found.append(load.energies_uj[:2])
+    return np.array(found)
+
+
+def _lengths(done: Trajectories) -> Floats:
+    """Return the lengths (N,), mm, of the needles in the tissue at the end."""
+    found = []
+    for shape in done.shapes[:, -1, :, : Z + 1]:
+        inside = shape[:, X] > 0.0
+        skin = [np.interp(0.0, shape[:, X], shape[:, k]) for k in range(3)]
+        found.append(np.linalg.norm(np.diff(np.vstack([skin, shape[inside]]), axis=0), axis=1).sum())
+    return np.array(found)
+
+
+def _parts(across_: Laterals) -> Floats:
+    return np.stack([across_.real, across_.imag], axis=1)
+
+
+# ---- clearance
+
+
+def _measure_clearance(
+    simulator: Simulator, zones: ZoneMap, done: Trajectories, reached: Flags
+) -> dict[str, Any]:
+    """Return the fields of `EntryMap` that depend on zones."""
+    axes, paths = simulator.scenario.setup.axes, _paths(simulator.scenario, done)
+    slack = _least_clearances(simulator, _with_margins(zones), done) - zones.margin
+    clear = reached & (slack >= 0.0)
+    apart = _from_margins(zones, paths).min(axis=2)
+    lacking = np.maximum(apart.min(axis=0, initial=_FAR_MM) - slack, 0.0)[clear]
+    sizes = np.zeros((2, len(paths)))
+    for size, find in zip(sizes, (find_offsets, find_angles), strict=True):
+        size[clear] = find(paths[clear], partial(_slack, zones), lacking, axes)
+    return {
+        "clear": clear,
+        "clearance_mm": _least_clearances(simulator, zones.exact, done),
+        "zone": apart.argmin(axis=0) if zones else np.full(len(paths), -1),
+        "offset_mm": sizes[0],
+        "angle_mrad": 1e3 * sizes[1],
+    }
+
+
+def _with_margins(zones: ZoneMap) -> Zones:
+    """Return the zones with distances at any distance, larger by the differences of their margins."""
+    rows = zones.exact.rows.copy()
+    rows[:, MORE] += zones.margins - zones.margin
+    return zones.exact._replace(rows=rows)
+
+
+def _least_clearances(simulator: Simulator, zones: Zones, done: Trajectories) -> Floats:
+    """Return the least clearances (N,), mm, in the tissue; infinite without zones."""
+    again = simulator.with_zones(zones).rollout(
+        simulator.start(), done.controls, outputs="clearance", limits=False
+    )
+    found: Floats = np.where(done.tips[:, :, X] > 0.0, again.clearance, np.inf).min(axis=1)
+    return found
+
+
+def _from_margins(zones: ZoneMap, points: Floats) -> Floats:
+    """Return the distances (z, …), mm, of the needle at points (…, 3) of its axis from the margins."""
+    margins = zones.margins.reshape(-1, *[1] * (points.ndim - 1))
+    found: Floats = zones.clearances(points) - margins
+    return found
+
+
+def _slack(zones: ZoneMap, points: Floats) -> Floats:
+    """Return the distances (…), mm, of the needle at points (…, 3) from the nearest margin."""
+    nearest: Floats = _from_margins(zones, points).min(axis=0, initial=np.inf)
+    return nearest
+
+
+def _paths(scenario: Scenario, done: Trajectories) -> Floats:
+    """Return points (N, p, 3) of each insertion: its entry point, path of the tip, and needle at some depths."""
+    goal = scenario.target.depth_mm
+    depths = np.linspace(0.0, goal, int(np.ceil(goal / scenario.contact.spacing_mm)) + 1)
+    parts = [_at(depths, done.tips)]
+    for share in _MOMENTS:
+        step = np.argmax(done.tips[:, :, X] >= share * goal, axis=1)
+        parts.append(_at(depths[depths <= share * goal], done.shapes[np.arange(len(step)), step]))
+    parts.append(_at(depths, done.shapes[:, -1]))
+    return np.concatenate(parts, axis=1)
+
+
+def _at(depths: Floats, poses: Floats) -> Floats:
+    """Return points (N, p, 3) at depths (p,) of lines of poses (N, k, 5), at their ends beyond these."""
+    found = np.empty((len(poses), len(depths), 3))
+    for points, line in zip(found, poses, strict=True):
+        x = np.maximum.accumulate(line[:, X])
+        points[:, X] = np.minimum(depths, x[-1])
+        for axis in (Y, Z):
+            points[:, axis] = np.interp(depths, x, line[:, axis])
+    return found
