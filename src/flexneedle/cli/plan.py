@@ -19,6 +19,7 @@ from flexneedle.cli.common import (
     run_name,
     target_row,
 )
+from flexneedle.cli.entries import map_entries
 from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
@@ -34,15 +35,26 @@ def add_parser(commands: Commands) -> None:
         commands,
         "plan",
         "plan an insertion and draw the plan",
-        _plan,
+        run_plan,
         "flexneedle plan phantom --target 40 1.5 --strategy both",
         "flexneedle plan mine.toml --seed 3 --json",
+        "flexneedle plan mine.toml --entries",
     )
     add_run_arguments(parser)
     add_strategy(parser, "manipulation moves guide and bevel, steering only the bevel", "both")
+    parser.add_argument(
+        "--entries",
+        action="store_true",
+        help="instead of a plan: a map of the free entry points with clearance, load and tolerance, without motion of "
+        "the guide",
+    )
+    parser.set_defaults(write_entries=lambda *_: None)
 
 
-def _plan(args: argparse.Namespace) -> int:
+def run_plan(args: argparse.Namespace) -> int:
+    """Plan, or map the entries; return the exit status."""
+    if args.entries:
+        return map_entries(args)
     from flexneedle.cli.progress import Progress
     from flexneedle.planning.events import Event, Iterated
     from flexneedle.record.folder import Folder

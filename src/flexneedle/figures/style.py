@@ -30,6 +30,7 @@ _widths = [WIDTH]  # the last one is in use
 # Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
 INK, QUIET = "#222222", "#6b6b6b"
 PLAN, ESTIMATE, TRUE, MEASURED, TARGET, BAD = "#222222", "#0072B2", "#D55E00", "#A8437F", "#00734f", "#B03A00"
+ZONE = "#6A4C93"
 NEEDLE, GUIDE = "#8a8f98", "#4d535c"
 STRATEGIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 

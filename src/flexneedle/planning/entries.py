@@ -1,22 +1,22 @@
 """Maps of entry points: from which the target is reached, with what clearance, load and tolerance.
 
-Each entry gets the slope and the pattern of rolls that suit it best, without motion of the guide: first by superposition
-(`planning.ways`), of which the best few are carried out, with the slope corrected by the miss.
+Each entry gets the slope and the pattern of rolls that suit it best, without motion of the guide. The best few are
+chosen by superposition (`planning.ways`) and carried out, with the slope corrected by the miss.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.errors import InputError
 from flexneedle.invasiveness import Invasiveness
 from flexneedle.mechanics.zones import MORE, Zones
-from flexneedle.planning.entry import add_along, read_entry, with_entry
+from flexneedle.planning.entry import add_along, read_entry
+from flexneedle.planning.entry_map import PRECISE_MM, EntryMap, Whole
 from flexneedle.planning.planner import make_room
 from flexneedle.planning.primitives import make_controls
 from flexneedle.planning.problem import ROUNDING, PlanProblem, make_problem
@@ -28,93 +28,12 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.zones import ZoneMap, zones_of
 from flexneedle.types import DB_X, DB_Z, PSI, ROLL, THETA, Flags, Floats, Laterals, X, Y, Z, across
 
-Whole = NDArray[np.intp]
-PRECISE_MM = 0.1
-"""Largest distance from the target at which an entry reaches it."""
 _COUNTS = {1: 121, 2: 600}  # of entries, about, by the number of axes
 _TRIED = 3  # patterns of each entry that are carried out
 _ROUNDS = 3  # of corrections
-_RESERVE_MM = 0.9  # of clearance beyond the margin that superposed paths are charged for
-_MOMENTS = (0.3, 0.5, 0.7, 0.85)  # shares of the depth at which the needle's shape is in a path
-_ROOM_MM = 0.1  # in which rooms are equal
+_RESERVE_MM = 0.1  # of clearance beyond the margin, for which superposed paths are charged
+_MISS = 10.0  # cost of a miss by a slope that is not free, since nothing corrects it
 _FAR_MM = 1e3
-_APART = 0.25  # of the disc's radius, of entries that are distinct
-
-
-@dataclass(frozen=True, eq=False)
-class EntryMap:
-    """Entry points of a scenario, E of them, each with the best insertion to the target that was found for it.
-
-    Attributes:
-        scenario: The scenario, with a free entry.
-        points: y, z of the entry points on the skin (E, 2), mm.
-        slopes: Slopes dy/dx, dz/dx of the axis (E, 2), rad.
-        reached: Whether the target is reached (E,), within 0.1 mm, from the entry with a slope that is free, and with
-            loads that the guard permits.
-        clear: Whether it is reached with all margins of zones kept (E,).
-        error_mm: Distance of the tip from the target at the end (E,).
-        clearance_mm: Least clearance of the inserted needle from the zones over the insertion (E,), a bound; infinite
-            without zones.
-        zone: Number of the zone that is nearest, by clearance less margin (E,); −1 without zones.
-        length_mm: Length of the needle in the tissue at the end (E,).
-        peak_energy_uj, mean_energy_uj: Energy stored in the tissue (E,), as in `Invasiveness`.
-        offset_mm: By how much the inserted needle may be displaced along y, and z, in any direction, before it enters
-            a margin (E,); a lower bound; 0 where not clear.
-        angle_mrad: By how much it may be turned about the entry point (E,), likewise.
-        rolls: Angle of the needle before the first step (E,), rad.
-        controls: Columns of `Control` (E, m, 9), from the needle at its entry; steps at the end may be 0.
-    """
-
-    scenario: Scenario
-    points: Floats
-    slopes: Floats
-    reached: Flags
-    clear: Flags
-    error_mm: Floats
-    clearance_mm: Floats
-    zone: Whole
-    length_mm: Floats
-    peak_energy_uj: Floats
-    mean_energy_uj: Floats
-    offset_mm: Floats
-    angle_mrad: Floats
-    rolls: Floats
-    controls: Floats
-
-    @property
-    def room_mm(self) -> Floats:
-        """Tolerance of each entry as a length (E,): of its offset, or of its angle times the length, the smaller."""
-        room: Floats = np.minimum(self.offset_mm, 1e-3 * self.angle_mrad * self.length_mm)
-        return room
-
-    @property
-    def order(self) -> Whole:
-        """Entries from the best: reached and clear, then with the larger room, then with less peak energy.
-
-        Of entries that are not clear, those with the larger clearance are first. Rooms within 0.1 mm are equal.
-        """
-        room = np.where(self.clear, np.round(self.room_mm / _ROOM_MM), np.minimum(self.clearance_mm, 0.0))
-        return np.lexsort((self.peak_energy_uj, -room, ~self.clear, ~self.reached))
-
-    def best(self, count: int) -> list[int]:
-        """Return up to `count` clear entries, from the best, at least a quarter of the disc's radius apart."""
-        least, chosen = _APART * self.scenario.entry.free_radius_mm, list[int]()
-        for k in self.order[self.clear[self.order]].tolist():
-            if len(chosen) < count and all(
-                np.linalg.norm(self.points[k] - self.points[other]) >= least for other in chosen
-            ):
-                chosen.append(k)
-        return chosen
-
-    def scenario_at(self, entry: int) -> Scenario:
-        """Return the scenario with its entry fixed at one of the map."""
-        own = self.scenario.entry
-        (y, z), slope = self.points[entry].tolist(), complex(*self.slopes[entry])
-        return with_entry(self.scenario, complex(y, z) - own.lateral(0.0), slope - own.slope)
-
-    def take(self, which: Whole) -> "EntryMap":
-        """Return the map of some entries."""
-        return EntryMap(self.scenario, *(getattr(self, each.name)[which] for each in fields(self)[1:]))
 
 
 def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) -> EntryMap:
@@ -128,9 +47,7 @@ def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) 
         InputError: Point or slope of the entry are fixed, or a zone's file cannot be used.
     """
     scenario = load_scenario(scenario)
-    for key in ("free_radius_mm", "free_slope_mrad"):
-        if not getattr(scenario.entry, key):
-            raise InputError(f"entry.{key} = 0: must be above 0 for a map of entries, on which it is free")
+    check_free(scenario)
     zones, simulator = zones_of(scenario), Simulator(scenario, threads)
     usual = make_problem(scenario, scenario.target.position, "steering")
     problem = replace(usual, clear=zones.margin + _RESERVE_MM, length=scenario.needle.length_mm)
@@ -139,6 +56,13 @@ def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) 
     order = found.order
     _, first = np.unique(number[order], return_index=True)
     return found.take(order[first])
+
+
+def check_free(scenario: Scenario) -> None:
+    """Raise InputError unless point and slope of the entry are free."""
+    for key in ("free_radius_mm", "free_slope_mrad"):
+        if not getattr(scenario.entry, key):
+            raise InputError(f"entry.{key} = 0: must be above 0 for a map of entries")
 
 
 def _superpose(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> tuple[Floats, Whole]:
@@ -151,10 +75,12 @@ def _superpose(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> tu
     responses, point = Responses.of(rollout, problem), _grid(problem)
     ends = responses.patterns.paths[:, -1]
     slope = (complex(*problem.target[1:]) - ends - point[:, None]) / problem.target[0]
-    slope *= np.minimum(1.0, problem.entry[1] / np.maximum(np.abs(slope), np.finfo(float).tiny))
+    steep = np.maximum(np.abs(slope) / problem.entry[1], 1.0)
+    slope /= steep
     entry, pattern = np.indices(slope.shape)
     ways = responses.enter(pattern.ravel(), point[entry.ravel()], slope.ravel())
     costs = rate(problem, ways, make_room(simulator.scenario, zones)).reshape(slope.shape)
+    costs += _MISS * (steep - 1.0) * problem.entry[1] * problem.target[0]
     best = np.argsort(costs, axis=1, kind="stable")[:, :_TRIED]
     chosen = np.arange(len(point))[:, None] * slope.shape[1] + best
     return ways.z[chosen.ravel()], np.repeat(np.arange(len(point)), best.shape[1])
@@ -203,8 +129,9 @@ def _carry_out(
     simulator: Simulator, problem: PlanProblem, zones: ZoneMap, rows: Floats, z: Floats
 ) -> EntryMap:
     """Return the map of insertions by controls (N, m, 9) with coordinates z (N, d)."""
-    outputs = ("energy", "stretch", "strain", "shapes")
-    done = simulator.rollout(simulator.start(), rows, outputs=outputs, limits=False)
+    done = simulator.rollout(
+        simulator.start(), rows, outputs=("energy", "stretch", "strain"), at_end=("shapes",), limits=False
+    )
     point, slope = read_entry(problem, z[:, z.shape[1] - problem.entry_coordinates :])
     error = np.linalg.norm(done.tips[:, -1, : Z + 1] - problem.target, axis=1)
     is_free = np.abs(point - _entry_point(problem, z)) <= ROUNDING
@@ -237,8 +164,9 @@ def _entry_point(problem: PlanProblem, z: Floats) -> Laterals:
 def _is_permitted(problem: PlanProblem, done: Trajectories) -> Flags:
     """Return whether loads of needle and tissue (N,) are within the limits of the guard."""
     limits = problem.loads.values
-    strained = done.strain.max(axis=1) > limits["strain"]
-    return ~strained & (1.0 - done.stretch.min(axis=1) <= limits["compression"]) & done.converged.all(axis=1)
+    strain, compression = done.strain.max(axis=1), 1.0 - done.stretch.min(axis=1)
+    kept: Flags = (strain <= limits["strain"]) & (compression <= limits["compression"])
+    return kept & done.converged.all(axis=1)
 
 
 def _energies(simulator: Simulator, problem: PlanProblem, done: Trajectories) -> Floats:
@@ -269,8 +197,8 @@ def _lengths(done: Trajectories) -> Floats:
     return np.array(found)
 
 
-def _parts(across_: Laterals) -> Floats:
-    return np.stack([across_.real, across_.imag], axis=1)
+def _parts(lateral: Laterals) -> Floats:
+    return np.stack([lateral.real, lateral.imag], axis=1)
 
 
 # ---- clearance
@@ -327,15 +255,10 @@ def _slack(zones: ZoneMap, points: Floats) -> Floats:
 
 
 def _paths(scenario: Scenario, done: Trajectories) -> Floats:
-    """Return points (N, p, 3) of each insertion: its entry point, path of the tip, and needle at some depths."""
+    """Return points (N, p, 3) of each insertion: its entry point, the path of the tip, and the needle at the end."""
     goal = scenario.target.depth_mm
     depths = np.linspace(0.0, goal, int(np.ceil(goal / scenario.contact.spacing_mm)) + 1)
-    parts = [_at(depths, done.tips)]
-    for share in _MOMENTS:
-        step = np.argmax(done.tips[:, :, X] >= share * goal, axis=1)
-        parts.append(_at(depths[depths <= share * goal], done.shapes[np.arange(len(step)), step]))
-    parts.append(_at(depths, done.shapes[:, -1]))
-    return np.concatenate(parts, axis=1)
+    return np.concatenate([_at(depths, done.tips), _at(depths, done.shapes[:, -1])], axis=1)
 
 
 def _at(depths: Floats, poses: Floats) -> Floats:

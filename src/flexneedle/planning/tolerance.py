@@ -64,8 +64,8 @@ def _widen(
     farther from the nearer one than `gap` times its size.
     """
     gap = 2.0 * np.sin(0.5 * np.pi / _DIRECTIONS) if axes == 2 else 0.0
-    left = (slack(paths) - lacking[:, None]) / arms
-    size = np.clip(left.min(axis=1), 0.0, most)
+    first: Floats = ((slack(paths) - lacking[:, None]) / arms).min(axis=1)
+    size = np.clip(first, 0.0, most)
     active = np.flatnonzero((size > 0.0) & (size < most))
     fine = _FINE / arms.max(axis=1)
     for _ in range(_ROUNDS):
