@@ -9,7 +9,17 @@ from matplotlib.figure import Figure
 
 from flexneedle.figures import scene
 from flexneedle.figures.layout import legend_of, mosaic, short
-from flexneedle.figures.style import BAD, ESTIMATE, INK, QUIET, ZONE, apply_style, is_column, small
+from flexneedle.figures.style import (
+    BAD,
+    ESTIMATE,
+    INK,
+    QUIET,
+    ZONE,
+    apply_style,
+    format_signed,
+    is_column,
+    small,
+)
 from flexneedle.planning.entry_map import EntryMap
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.zones import zones_of
@@ -18,9 +28,10 @@ from flexneedle.types import Flags, Floats, Y, Z
 NUMBERED = 5
 """Number of the best entries that are marked."""
 _COLORS = "viridis"
-_SQUARE = ("clearance along", "offset along")  # in a column, side by side
+_SQUARE = {"clearance along": "Clearance (mm)", "offset along": "Tolerance (mm)"}  # in a column, side by side
 _LAYERS, _CELLS = 40, 120  # of the silhouette of a zone
 _SKIN_MM, _DEEP_MM = 0.01, 1e9
+_BOX = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 0.6}
 _ROOM = 1.08  # of the disc of entries around it
 
 
@@ -35,9 +46,9 @@ class _Quantity(NamedTuple):
 def entries_figure(found: EntryMap) -> Figure:
     """Return the figure of a map of entries."""
     scenario, shown = found.scenario, _quantities(found)
-    target = scene.place(scenario, scenario.target.position)
-    clear = f"{found.clear.sum()} of {len(found.clear)} clear"
-    title = f"{short(scenario.name, 40)}: entries to {target}, {clear}"
+    target = ", ".join(format_signed(value) for value in scenario.target.position[: 1 + scenario.setup.axes])
+    clear = f"{found.clear.sum()} of {len(found.clear)} entries"
+    title = f"{short(scenario.name, 40)}: clear insertions to ({target}) mm from {clear}"
     with apply_style():
         if scenario.setup.axes == 1:
             names = [name.partition(" ")[0] for name in shown]
@@ -51,6 +62,8 @@ def entries_figure(found: EntryMap) -> Figure:
             figure, axes = mosaic(title, 8.2, rows, [1.0] * len(rows), [1.0, 1.0])
             for name in names:
                 _draw_discs(axes[name], found, shown[name])
+                if is_column():
+                    axes[name].set_title(_SQUARE[name])
         legend_of(figure, axes.values())
     return figure
 
@@ -117,7 +130,7 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
         figure: Any = ax.figure
         figure.colorbar(discs, ax=ax, shrink=0.8, pad=0.02).outline.set_visible(False)
     scene.draw_target(ax, found.scenario.target.position, scene.ALONG)
-    for number, k in enumerate(found.best(NUMBERED), 1):
+    for number, k in enumerate(found.best(1 if is_column() else NUMBERED), 1):
         _mark(ax, found.points[k], number)
 
 
@@ -145,19 +158,14 @@ def _add_discs(ax: Axes, found: EntryMap, which: Flags, share: float, **how: Any
 
 
 def _mark(ax: Axes, point: Floats, number: int) -> None:
-    how: dict[str, Any] = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "markeredgecolor": INK}
-    label = "recommended entry (1), and the next" if number == 1 else "_next"
-    ax.plot(
-        *point[::-1],
-        linestyle="none",
-        markeredgewidth=1.6 if number == 1 else 0.8,
-        zorder=6,
-        label=label,
-        **how,
-    )
-    beside: dict[str, Any] = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": small()}
-    box = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 0.6}
-    ax.annotate(str(number), (point[1], point[0]), bbox=box, weight="bold", zorder=7, **beside)
+    """Mark one of the best entries, with its number where there is room."""
+    size, width = (5 if is_column() else 8), (1.6 if number == 1 else 0.8)
+    how: dict[str, Any] = {"markersize": size, "markerfacecolor": "none", "markeredgewidth": width}
+    label = "recommended entry" if is_column() else "recommended entry (1), and the next"
+    ax.plot(*point[::-1], "o", markeredgecolor=INK, zorder=6, label=label, **how)
+    if not is_column():
+        beside: dict[str, Any] = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": small()}
+        ax.annotate(str(number), (point[1], point[0]), bbox=_BOX, weight="bold", zorder=7, **beside)
 
 
 def _draw_zones(ax: Axes, scenario: Scenario) -> None:
@@ -175,8 +183,15 @@ def _draw_zones(ax: Axes, scenario: Scenario) -> None:
             least = layers.min(axis=0)
             if least.min() < 0.0:
                 ax.contourf(z, y, least, [-_DEEP_MM, 0.0], colors=[ZONE], alpha=alpha, zorder=1)
+                ax.contour(z, y, least, [0.0], colors=[ZONE], linewidths=0.8, zorder=4)
         deepest = np.unravel_index(int(each.min(axis=0).argmin()), each.shape[1:])
         if each.min() < 0.0:
             where = float(z[deepest[1]]), float(y[deepest[0]])
-            ax.text(*where, name, color=ZONE, fontsize=small(), ha="center", zorder=4, clip_on=True)
             ax.fill([], [], color=ZONE, alpha=0.16, label="zone, silhouette (darker at the skin)")
+            if not is_column():
+                _name(ax, where, name)
+
+
+def _name(ax: Axes, where: tuple[float, float], name: str) -> None:
+    how: dict[str, Any] = {"color": ZONE, "fontsize": small(), "ha": "center", "va": "center"}
+    ax.text(*where, name, bbox=_BOX, zorder=5, clip_on=True, **how)
