@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach front calibration wide worlds space worlds-space tuning slicer docs lint clean
+.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration wide worlds space worlds-space tuning slicer docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -10,7 +10,7 @@ PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 # Targets that run scripts, each with a quick mode.
-SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach front calibration wide worlds space worlds-space tuning slow docs
+SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration wide worlds space worlds-space tuning slow docs
 
 # With QUICK=1 each of them does everything that it does, on a few cases, in seconds; results go to a temporary folder.
 quick = $(if $(QUICK),$(1))
@@ -154,6 +154,9 @@ far-targets: setup  ## plans to targets up to the edge of the reach, near the sk
 plan-reach: setup  ## plans of 200 random worlds, and what a search of 20 times the size finds where they miss
 	$(BIN)/python studies/plan_reach.py $(call quick,--worlds 100000 1 --factor 2)
 
+tilted-skin: setup  ## insertions where skin and layers are deeper or shallower than planned, as by a tilted skin
+	$(BIN)/python studies/tilted_skin.py $(call quick,--worlds 100000 1)
+
 front: setup  ## error against peak tissue energy of five controllers and the oracle on 40 random worlds from soft tissue to stiff gel, with the figure (DIR=runs/front; minutes)
 	$(BIN)/python studies/front.py --out $(OUT) $(call quick,--worlds 100000 1 --oracle 1 --samples 16 --iterations 3)
 
@@ -189,6 +192,7 @@ docs: setup  ## build the documentation site into site/; warnings are errors
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/scenario_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/rig_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/recording_reference.py
+	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/case_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/command_reference.py
 	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/rig_states.py
 	$(call quick,cd $(OUT) &&) PYTHONPATH=tools/docs $(abspath $(BIN))/zensical build --strict --clean

@@ -1,24 +1,56 @@
 """Random rooms: worlds with zones to avoid, in the plane and in space.
 
-A room has 1 to 6 zones about the line from the entry to the target: spheres, capsules, boxes, curved vessels and walls
-with a gap. None encloses the target or, with its margin, the fixed entry.
+    python studies/rooms.py plans [--first N] [--count N] [--larger FACTOR] [--jobs N] [--out FILE]
+    python studies/rooms.py loops [--first N] [--count N] [--sd MM] [--displaced MM] [--blind] [--jobs N] [--out FILE]
+
+A room is a wide world with about 1 to 6 zones beside the line from the entry to the target: spheres, capsules, boxes,
+curved vessels (of capsules) and walls with a gap. None has, with its margin, the target or the fixed entry in it. Each
+number is a room in the plane and one in space, with a free entry (15 mm, 200 mrad) and a fixed one.
+
+plans: how many are clear and end within 0.5 mm of the target, also by a search with FACTOR times the samples; time over
+that without zones (CPU); clearances of the exact plant without mismatch, every 0.25 mm, which a plan must not exceed.
+
+loops: insertions of clear plans into the exact plant with the mismatch that ships, zones displaced by a normal
+registration error with the standard deviation MM on each axis, of which the scenario knows (`image.sd_mm`), compared
+with the same insertions without zones. --displaced: by this distance in the worst of 12 directions, which the scenario
+does not know; --blind: a controller without the terms of zones.
+
+Rooms below 1000 are for tuning, those from 100,000 on for reports.
 """
 
+import argparse
+import json
 import math
+import time
 from collections.abc import Callable
-from itertools import pairwise
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise, product
+from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flexneedle.scenario.model import Scenario
+import flexneedle
+from flexneedle import Plan, Scenario
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.plants import ExactPlant
 from flexneedle.scenario.worlds import PLANE, WIDE, has_rig, world
 from flexneedle.simulator.zones import ZoneMap, zones_of
+from flexneedle.types import ROLL
 
 _RIGS = ("two-axes", "one-axis", "no-guide", "two-axes-half-turns")
 _FREE = {"entry.free_radius_mm": 15.0, "entry.free_slope_mrad": 200.0}
 _ROOM_MM = 0.5  # of the target beyond the margin
 _TRIES = 200
+_ERROR_MM = 0.5  # of a plan that counts as found
+_SUBSTEPS = 4  # of a step of 1 mm in the independent check
+_DIRECTIONS = 12
+_MARGIN_MM = 2.0
+_REFUTED_MM = 0.0
+_PLACES = ("center_mm", "from_mm", "to_mm", "point_mm")
 _Make = Callable[[Any], list[dict[str, Any]]]
 
 
@@ -134,3 +166,202 @@ def _wall(rng: np.random.Generator, at: Any, space: bool) -> list[dict[str, Any]
 
 
 _SHAPES = {"sphere": _sphere, "capsule": _capsule_at, "box": _box, "vessel": _vessel}
+
+
+# ---- plans
+
+
+def kinds(first: int, count: int) -> list[tuple[int, bool, bool]]:
+    """Return number, free entry and space of all rooms."""
+    return [
+        (k, free, space)
+        for free, space in product((True, False), (False, True))
+        for k in range(first, first + count)
+    ]
+
+
+def is_found(plan: Plan) -> bool:
+    """Return whether a plan keeps all margins and limits, and ends near the target."""
+    return not plan.intrusion_mm and not plan.refusal and plan.error_mm <= _ERROR_MM
+
+
+def exact_clearance(scenario: Scenario, plan: Plan) -> float:
+    """Return the least clearance less margin (mm) of the exact plant without mismatch that carries out a plan."""
+    made = plan.scenario or scenario
+    plant = ExactPlant(draw(made, np.random.default_rng(0)), plan.roll)
+    zones = zones_of(made.with_values({"image.sd_mm": 0.0}))
+    least = math.inf
+    for row in plan.controls:
+        for part in range(_SUBSTEPS):
+            now = row / _SUBSTEPS
+            now[ROLL] = row[ROLL] if part == 0 else 0.0
+            plant.step(now)
+            found = zones.clearances(plant.nodes) + (zones.added - zones.margins)[:, None]
+            least = min(least, float(found.min()))
+    return least
+
+
+def plan_room(job: tuple[int, bool, bool], larger: int) -> dict[str, Any]:
+    """Return the row of a room."""
+    number, free, space = job
+    scenario = room(number, free=free, space=space, case="perfect")
+    without = scenario.with_values({"zone": []})
+    flexneedle.plan(without, threads=1)  # compiled, in the cache
+    begun = time.process_time()
+    plain = flexneedle.plan(without, threads=1)
+    between = time.process_time()
+    plan = flexneedle.plan(scenario, threads=1)
+    ended = time.process_time()
+    zones = zones_of(scenario)
+    row = {
+        "room": number, "free": free, "space": space, "zones": len(scenario.zone),
+        "touched": bool(zones.clearances(plain.shapes[..., :3]).min() < 0.0),
+        "same": bool(np.array_equal(plan.controls, plain.controls)),
+        "found": is_found(plan), "error": plan.error_mm, "clearance": plan.least_clearance_mm,
+        "exact": exact_clearance(scenario, plan) if is_found(plan) else None,
+        "seconds": ended - between, "ratio": (ended - between) / (between - begun),
+    }  # fmt: skip
+    if larger > 1:
+        searched = flexneedle.plan(
+            scenario.with_values({"plan.samples": larger * scenario.plan.samples}), threads=1
+        )
+        row["larger"] = is_found(searched)
+    return row
+
+
+def print_plans(rows: list[dict[str, Any]]) -> None:
+    """Print a line for free and fixed entries, and one for times."""
+    print(
+        "|entry|rooms|touched without zones|clear and within 0.5 mm|of those that the larger search finds|refuted|"
+    )
+    print("|---|---|---|---|---|---|")
+    for free in (True, False):
+        own = [row for row in rows if row["free"] == free]
+        of = [row["found"] for row in own if row.get("larger")]
+        refuted = [row["room"] for row in own if row["exact"] is not None and row["exact"] < -_REFUTED_MM]
+        print(
+            f"|{'free' if free else 'fixed'}|{len(own)}|{sum(row['touched'] for row in own)}"
+            f"|{sum(row['found'] for row in own)}|{sum(of)} of {len(of)}|{refuted or 'none'}|"
+        )
+    ratios, seconds = (np.array([row[key] for row in rows]) for key in ("ratio", "seconds"))
+    changed = np.array([not row["same"] for row in rows])
+    print(
+        f"time over that without zones: median {np.median(ratios):.2f}, of changed plans "
+        f"{np.median(ratios[changed]):.2f}; longest {seconds.max():.1f} s"
+    )
+
+
+# ---- insertions
+
+
+def displace(scenario: Scenario, shift: Any) -> Scenario:
+    """Return the scenario with its zones where they are, displaced by a vector (3,), and known."""
+    zones = [
+        {key: np.add(value, shift).tolist() if key in _PLACES else value for key, value in zone.items()}
+        for zone in scenario.values()["zone"]
+    ]
+    return scenario.with_values({"zone": zones, "image.sd_mm": 0.0})
+
+
+def insert_room(
+    job: tuple[int, bool, bool], sd: float, displaced: float, blind: bool
+) -> dict[str, Any] | None:
+    """Return the row of an insertion with zones and one without; None without a plan that is found."""
+    number, free, space = job
+    scenario = room(number, free=free, space=space).with_values({"image.sd_mm": sd})
+    plan = flexneedle.plan(scenario, threads=1)
+    if not is_found(plan):
+        return None
+    rng = np.random.default_rng([20261130, number])
+    shift = rng.normal(0.0, sd, 3) * [1.0, 1.0, float(space)]
+    if displaced:
+        shift = _worst_shift(scenario, plan, displaced, space)
+    there = displace(scenario, shift)
+    used = there if displaced else scenario
+    if blind:
+        used = used.with_values({"control.adaptive_mpc.zone_weight": 0.0})
+    plan = _of(plan, used)
+    done, true = flexneedle.insert(used, plan, seed=number, threads=1, force=bool(displaced)), zones_of(there)
+    without = scenario.with_values({"zone": []})
+    plain = flexneedle.insert(without, flexneedle.plan(without, threads=1), seed=number, threads=1)
+    least = min(
+        (true.clearances(p.true_shape).min() for p in done.periods if p.true_shape is not None),
+        default=np.inf,
+    )
+    return {
+        "room": number, "free": free, "space": space, "clearance": float(least + true.added.max()),
+        "estimated": min(p.clearance for p in done.periods), "planned": plan.least_clearance_mm,
+        "outcome": str(done.outcome), "reason": done.reason, "error": done.true_error_mm,
+        "plan_error": plan.error_mm, "outcome_without": str(plain.outcome), "error_without": plain.true_error_mm,
+    }  # fmt: skip
+
+
+def _of(plan: Plan, scenario: Scenario) -> Plan:
+    """Return a plan as one of a scenario that differs in its zones alone, with the plan's entry."""
+    made = plan.scenario
+    entry = {f"entry.{key}": value for key, value in made.entry.model_dump().items()}
+    return replace(plan, scenario=scenario.with_values(entry))
+
+
+def _worst_shift(scenario: Scenario, plan: Plan, size: float, space: bool) -> Any:
+    """Return the displacement (3,) of this size, of some directions across the needle, after which a plan is nearest."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False) if space else np.array([0.0, np.pi])
+    shifts = size * np.stack([np.zeros_like(angles), np.cos(angles), np.sin(angles) * space], axis=1)
+    least = [zones_of(displace(scenario, each)).clearances(plan.shapes[..., :3]).min() for each in shifts]
+    return shifts[int(np.argmin(least))]
+
+
+def print_loops(rows: list[dict[str, Any]]) -> None:
+    """Print a line for free and fixed entries."""
+    print(
+        "|entry|insertions|zones touched|margin entered by > 0.1 mm|held|held without zones|mean error|without zones|"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for free in (True, False):
+        own = [row for row in rows if row["free"] == free]
+        done = [row for row in own if row["outcome"] == row["outcome_without"] == "done"]
+        held, held_without = (
+            sum(row[key] != "done" for row in own) for key in ("outcome", "outcome_without")
+        )
+        means = [
+            np.mean([row[key] for row in done]) if done else np.nan for key in ("error", "error_without")
+        ]
+        print(
+            f"|{'free' if free else 'fixed'}|{len(own)}|{sum(row['clearance'] < 0.0 for row in own)}"
+            f"|{sum(row['clearance'] < _MARGIN_MM - 0.1 for row in own)}|{held}|{held_without}"
+            f"|{means[0]:.4f} mm|{means[1]:.4f} mm|"
+        )
+
+
+def main() -> None:
+    """Plan or insert in rooms, and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["plans", "loops"])
+    parser.add_argument("--first", type=int, default=100_000)
+    parser.add_argument("--count", type=int, default=25)
+    parser.add_argument("--larger", type=int, default=1)
+    parser.add_argument("--sd", type=float, default=0.5)
+    parser.add_argument("--displaced", type=float, default=0.0)
+    parser.add_argument("--blind", action="store_true")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    work = (
+        partial(plan_room, larger=given.larger)
+        if given.what == "plans"
+        else partial(insert_room, sd=given.sd, displaced=given.displaced, blind=given.blind)
+    )
+    rows = []
+    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(work, kinds(given.first, given.count)):
+            if row is not None:
+                rows.append(row)
+                if given.out:
+                    given.out.write_text("".join(json.dumps(each) + "\n" for each in rows))
+    (print_plans if given.what == "plans" else print_loops)(rows)
+
+
+if __name__ == "__main__":
+    main()

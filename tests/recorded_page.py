@@ -3,6 +3,8 @@
 The needle begins at x = -90 mm, its guide is at -41 mm, its tip at the start at -28.5 mm; the skin is x = 0.
 """
 
+from itertools import product
+
 import numpy as np
 
 from flexneedle.lab.page.protocol import (
@@ -12,6 +14,8 @@ from flexneedle.lab.page.protocol import (
     InsertionMessage,
     IterationMessage,
     JobMessage,
+    NearestZone,
+    PageZone,
     PlanMessage,
     ReachMessage,
     RowsMessage,
@@ -21,6 +25,8 @@ from flexneedle.lab.page.protocol import (
     StudyRow,
     StudyRowsMessage,
     WelcomeMessage,
+    ZonesMessage,
+    ZoneSurface,
 )
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
 
@@ -42,6 +48,34 @@ WELCOME = WelcomeMessage(
 
 def clients(clients=1, steering=None):
     return ClientsMessage(clients=clients, steering=steering)
+
+
+def cube(center, half):
+    """The surface of a cube."""
+    points = [np.array(center) + half * np.array(sides) for sides in product((-1.0, 1.0), repeat=3)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [index for a, b, c, d in faces for index in (a, b, c, a, c, d)]
+    return ZoneSurface(points=np.ravel(points).tolist(), triangles=triangles)
+
+
+ZONE = (20.0, 6.0, 2.0)
+
+
+def zones(of="scene", center=ZONE):
+    """A cubic zone that can be moved, and one of a file."""
+    surfaces = {"surface": cube(center, 2.0), "margin": cube(center, 4.0)}
+    moved = PageZone(name="node", margin_mm=2.0, places={"zone.0.center_mm": center}, **surfaces)
+    fixed = PageZone(
+        name="vessel",
+        margin_mm=2.0,
+        places={},
+        surface=cube((30.0, -6.0, 0.0), 1.0),
+        margin=cube((30.0, -6.0, 0.0), 3.0),
+    )
+    return ZonesMessage(of=of, zones=[moved, fixed])
+
+
+NEAREST = NearestZone(zone="node", clearance_mm=1.25, needle=(20.0, 2.0, 1.0), surface=(20.0, 4.0, 1.0))
 
 
 def session(revision=1, target=TARGET, reach_since=None, **changes):
@@ -67,7 +101,7 @@ def session(revision=1, target=TARGET, reach_since=None, **changes):
     return SessionMessage(revision=revision, reach_since=since, values=values, changed=[], doubts=[], **given)
 
 
-def scene(revision=1, target=TARGET, axes=2, point=(0.0, 0.0)):
+def scene(revision=1, target=TARGET, axes=2, point=(0.0, 0.0), places=()):
     return SceneMessage(
         revision=revision,
         axes=axes,
@@ -81,6 +115,7 @@ def scene(revision=1, target=TARGET, axes=2, point=(0.0, 0.0)):
         needle_radius_mm=0.41,
         axis={"point": point, "slope": (0.0, 0.0)},
         target=target,
+        zones=list(places),
     )
 
 
@@ -196,6 +231,7 @@ def row(index):
         "guide": (0.02 * index, 0.01 * index), "roll_deg": 3.0 * index, "indicator": 0.1,
         "energy_uj": 0.02 * index, "true_energy_uj": 0.021 * index,
         "miss_mm": (0.3 * (1 - index / PERIODS), -0.1), "miss_sd_mm": 0.5 * (1 - index / PERIODS) + 0.05,
+        "clearance_mm": 6.0 - 0.05 * index, "true_clearance_mm": 5.9 - 0.05 * index,
         "decide_ms": 12.0, "late": False, "warning": "",
     }  # fmt: skip
 

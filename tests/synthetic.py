@@ -59,6 +59,7 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0, step=STEP):
         strategy, (*target, 0.0)[:3], seed, 0.0, controls, tips, energy, np.column_stack([guide, 0.0 * guide]), shapes,
         sum(terms.values()), terms,
         12, True, history, "", 0.71, least_stretch=1.0 - 0.1 * inside,
+        clearance=np.where(depth > 0.0, 4.0 - inside, np.inf),
     )  # fmt: skip
 
 
@@ -89,6 +90,7 @@ def make_periods(plan, miss=0.06, seed=0):
             action=Action.MOVE, decision="turn" if flip else "nearer path",
             true_tip=true, true_strain_energy=plan.strain_energy[k + 1] * 1.25,
             true_stretch=float(1.0 - 0.17 * inside**2),
+            clearance=3.9 - inside, true_clearance=3.8 - inside,
             true_shape=plan.shapes[k + 1, :, :3] + [0.0, off, 0.0], energy_scale=0.04,
             durations={"observe": 0.001, "decide": 0.004, "total": 0.0051 + 1e-5 * k},
         )  # fmt: skip
@@ -111,5 +113,6 @@ def blind(period):
         true_tip=None,
         true_strain_energy=None,
         true_stretch=None,
+        true_clearance=None,
         true_shape=None,
     )

@@ -75,6 +75,7 @@ def test_it_plans_inserts_and_draws_without_the_laboratory(run, tmp_path):
         ("em watch --tracker aurora:/dev/null", "aurora"),
         ("insert phantom --ros neutral", "ros"),
         ("serve", "page"),
+        ("image example abdomen", "images"),
     ],
 )
 def test_a_command_without_its_extra_names_it(run, tmp_path, command, extra):

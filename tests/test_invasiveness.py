@@ -130,11 +130,13 @@ def test_a_needle_that_never_moved_has_loaded_nothing():
 
 
 def test_a_plan_file_of_an_earlier_version_has_no_stretch():
-    """It loads, with the stretch unknown and the rest as it was."""
+    """It loads, with the stretch unknown, no zones, and the rest as it was."""
     plan = make_plan()
     values = plan_values(plan)
-    del values["least_stretch"]
-    load = plan_from_values(values).invasiveness
+    del values["least_stretch"], values["clearance"]
+    again = plan_from_values(values)
+    assert again.least_clearance_mm == np.inf
+    load = again.invasiveness
     assert np.isnan(load.least_stretch)
     assert load.energies_uj == plan.invasiveness.energies_uj
 

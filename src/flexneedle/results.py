@@ -239,9 +239,8 @@ class Period:
     readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
     late: bool = False  # whether the decision came after the deadline, so that the needle rested
     energy_scale: float = math.nan  # E₁ (mJ): see `Scenario.energy_scale`
-    clearance: float = (
-        math.inf
-    )  # of the estimated needle from the zones to avoid (mm), a bound; infinite without zones
+    clearance: float = math.inf  # of the estimated needle from zones (mm), a bound; infinite without zones
+    true_clearance: float | None = None  # of the needle with its true shape, if it is known
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
@@ -319,6 +318,17 @@ class Insertion:
             rolls=self.flips,
             estimated=estimated,
         )
+
+    @property
+    def least_clearance_mm(self) -> float:
+        """Least clearance of the estimated needle from the zones to avoid; infinite without zones."""
+        return min((period.clearance for period in self.periods), default=math.inf)
+
+    @property
+    def true_clearance_mm(self) -> float:
+        """Least clearance of the true needle from the zones to avoid; NaN where its shape is not known."""
+        known = [period.true_clearance for period in self.periods if period.true_clearance is not None]
+        return min(known, default=math.nan)
 
     @property
     def warning(self) -> str:

@@ -2,10 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from commands import names, run
+from flexneedle.cli.common import clearance_rows
 from flexneedle.invasiveness import format_number
+from zoned import SPHERE, with_zones
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 STRATEGIES = ("manipulation", "steering")
@@ -30,7 +33,7 @@ PLAN_KEYS = [
         "guide_travel_mm",
         "energy_scale_uj",
     ),
-    *("iterations", "converged", "seed", "timing"),
+    *("clearance_mm", "iterations", "converged", "seed", "timing"),
 ]
 
 
@@ -60,3 +63,14 @@ def test_a_plan_that_misses_names_the_limit_and_fails(engine, capsys):
     assert status == 1
     assert "MISSES the target: best distance 2.510 mm" in out
     assert "limited by setup.max_guide_travel_mm" in out
+
+
+def test_the_row_of_the_clearance_names_the_nearest_zone_with_its_margin():
+    scenario = with_zones("phantom", {**SPHERE, "name": "far", "center_mm": [25.0, 30.0, 0.0]}, SPHERE)
+    straight = np.pad(np.arange(-60.0, 41.0)[:, None], ((0, 0), (0, 4)))
+    shapes = [straight - [30.0, 0.0, 0.0, 0.0, 0.0], straight]
+    found = clearance_rows(scenario, "least", 5.5, shapes)
+    assert found == {"least": "5.500 mm to node (margin 2 mm)"}
+    before = [straight - [40.0, 0.0, 0.0, 0.0, 0.0]]
+    assert clearance_rows(scenario, "least", np.inf, before) == {"least": "not in the tissue"}
+    assert clearance_rows(scenario.with_values({"zone": []}), "least", np.inf, shapes) == {}

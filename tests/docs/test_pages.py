@@ -22,6 +22,7 @@ SLOW = {
     "extend.md",
     "needle-and-tissue.md",
     "results.md",
+    "slicer.md",
     "studies.md",
     "targets.md",
     "tutorial.md",

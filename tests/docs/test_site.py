@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
+import case_reference
 import command_reference
 import flexneedle
 import math_fence
@@ -37,7 +38,7 @@ def entries(nav: object) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    "generator", [scenario_reference, rig_reference, recording_reference, command_reference]
+    "generator", [scenario_reference, rig_reference, recording_reference, case_reference, command_reference]
 )
 def test_generated_pages_are_up_to_date(generator):
     assert generator.PAGE.read_text(encoding="utf-8") == generator.page(), "make docs"

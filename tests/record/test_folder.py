@@ -139,6 +139,13 @@ def test_a_plan_is_restored_with_the_scenario_of_its_run(tmp_path):
     assert run.plans["manipulation"].scenario == run.scenario == load_scenario("phantom")
 
 
+def test_an_infinite_clearance_before_the_skin_is_restored():
+    plan = make_plan()
+    assert np.isinf(plan.clearance[0])
+    restored = plan_from_values(json.loads(to_text(plan_values(plan))))
+    np.testing.assert_array_equal(restored.clearance, plan.clearance)
+
+
 def test_a_plan_without_steps_is_restored():
     values = plan_values(make_plan())
     again = plan_from_values({**values, "controls": []})

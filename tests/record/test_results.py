@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.record.results import insertion_result, insertion_row, insertion_timing
+from flexneedle.record.results import insertion_result, insertion_row, insertion_timing, plan_result
 from flexneedle.results import Insertion, Outcome
 from flexneedle.types import UNKNOWN, Shape
 from synthetic import blind, make_insertion, make_plan
@@ -86,12 +86,22 @@ def test_missing_values_are_null():
     unknown = {name for name, value in result.items() if value is None}
     errors = {"true_error_mm", "residual_mm"}
     parts = {"phantom", "rig", "disturbed", "tip_true_mm", "tip_measured_mm", "strain_energy_mj", "warning"}
+    parts |= {"true_clearance_mm"}
     load = {"least_stretch", "energy_scale_uj"}
     assert unknown == parts | errors | load
     assert result["reached"] is False
     empty = Insertion(PLAN, 0, (), Outcome("failed"), "")
     assert insertion_result(empty)["steps"] == 0
     assert insertion_timing(empty)["period_ms"] == {"p50": None, "p99": None, "max": None}
+
+
+def test_the_clearance_of_an_insertion_is_the_least_of_its_periods_and_null_without_zones():
+    result = insertion_result(make_insertion())
+    found = [result[f"{name}clearance_mm"] for name in ("", "true_", "planned_")]
+    assert found == pytest.approx([2.9, 2.8, 3.0])
+    assert insertion_result(UNKNOWN_TIP)["clearance_mm"] == pytest.approx(2.9)
+    free = replace(PLAN, clearance=np.full(1, np.inf))
+    assert plan_result(free)["clearance_mm"] is None
 
 
 def test_one_unconverged_period_is_not_hidden():

@@ -15,7 +15,7 @@ from flexneedle.errors import InputError
 from flexneedle.record.fields import COLUMNS, from_row, parse_verdict, to_row
 from flexneedle.record.messages import joints
 from flexneedle.record.reader import read_trace
-from flexneedle.record.topics import TOPICS
+from flexneedle.record.topics import TOPICS, period_messages
 from flexneedle.record.writer import TraceWriter
 from flexneedle.types import (
     CheckedMeasurement,
@@ -165,8 +165,9 @@ def test_a_text_that_is_not_a_verdict_is_rejected(text):
 
 def test_columns_that_a_row_of_an_earlier_version_lacks_are_restored_as_unknown():
     row = to_row(PERIODS[0])
-    del row["stretch"], row["energy_scale_mj"]
+    del row["stretch"], row["energy_scale_mj"], row["clearance_mm"], row["true_clearance_mm"]
     restored = from_row(row, PERIODS[0].shape, {})
+    assert (restored.clearance, restored.true_clearance) == (np.inf, None)
     assert np.isnan([restored.stretch, restored.energy_scale]).all()
     assert restored.strain_energy == PERIODS[0].strain_energy
 
@@ -186,6 +187,13 @@ def test_columns_carry_units():
     }
     units = {"mm", "rad", "s", "mj", "n"}
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
+
+
+def test_a_period_without_zones_has_an_infinite_clearance_and_no_message_of_it(tmp_path):
+    period = replace(PERIODS[3], clearance=np.inf, true_clearance=np.inf)
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    assert (again.clearance, again.true_clearance) == (np.inf, np.inf)
+    assert not any(one.topic.endswith("clearance") for one in period_messages(period))
 
 
 def test_every_topic_has_a_message_each_period(trace_file):

@@ -71,7 +71,11 @@ def wrap(introduction: str, sections: str) -> str:
 
 def heading(table: Table) -> str:
     """Return the heading of a section."""
-    name = f"[[{table.name}]]" if table.name.endswith(("tissue", "terms", "zone")) else f"[{table.name}]"
+    name = (
+        f"[[{table.name}]]"
+        if table.name.endswith(("tissue", "terms", "zone", "layer"))
+        else f"[{table.name}]"
+    )
     return f"## `{name}`" if table.name else "## Top level"
 
 

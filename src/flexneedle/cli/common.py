@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from flexneedle.record.folder import Folder
     from flexneedle.results import Plan
     from flexneedle.scenario.model import Scenario
+    from flexneedle.types import Floats
 
 _TABLE_WIDTH = 200  # characters: a line that is wrapped in a table would split numbers
 
@@ -60,6 +61,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("X Y", "Z"),
         help="target in mm: depth X, lateral offset Y, in space also Z (default: scenario)",
     )
+    parser.set_defaults(load=load_named, image=None)
     add_seed(parser, "random seed")
     parser.add_argument(
         "--out",
@@ -96,12 +98,18 @@ def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> N
     )
 
 
+def load_named(args: argparse.Namespace) -> Scenario:
+    """Return the scenario of a name or path. An option may set another function as the default of `load`."""
+    from flexneedle.scenario.files import load_scenario
+
+    return load_scenario(args.scenario)
+
+
 def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
     """Return the scenario with the requested target and all controller settings. Raises ScenarioError."""
     from flexneedle.control.controllers import with_controller_defaults
-    from flexneedle.scenario.files import load_scenario
 
-    scenario = with_controller_defaults(load_scenario(args.scenario), *own, source=args.scenario)
+    scenario = with_controller_defaults(args.load(args), *own, source=args.image or args.scenario)
     return scenario if args.target is None else with_target(scenario, args.target)
 
 
@@ -132,6 +140,22 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
+def clearance_rows(
+    scenario: Scenario, title: str, clearance: float, shapes: Iterable[Floats]
+) -> dict[str, str]:
+    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle; none without zones."""
+    import numpy as np
+
+    from flexneedle.simulator.zones import zones_of
+
+    if not scenario.zone:
+        return {}
+    near = zones_of(scenario).closest(np.stack(list(shapes)), clearance)
+    if near is None:
+        return {title: "not in the tissue"}
+    return {title: f"{near.clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}
+
+
 def compile_first(*axes: int, phantoms: bool = True) -> None:
     """Compile the kernels for values of `setup.axes`, with a progress line if they are not in the cache.
 
@@ -150,7 +174,7 @@ def compile_first(*axes: int, phantoms: bool = True) -> None:
 
 def run_name(args: argparse.Namespace) -> str:
     """Return the scenario name used in the name of the run folder."""
-    return Path(args.scenario).stem
+    return Path(args.image or args.scenario).stem
 
 
 def print_json(values: Mapping[str, Any]) -> None:

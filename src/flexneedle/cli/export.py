@@ -38,13 +38,13 @@ def add_parser(commands: Commands) -> None:
         commands,
         "export",
         "export the control periods or the tracker readings of a run",
-        _export,
+        export,
         "flexneedle export runs/mine --csv",
         "flexneedle export runs/mine --readings - | head",
         notes=_COLUMN_HELP,
     )
     parser.add_argument("run", metavar="RUN", type=expand_home, help="folder of the run")
-    what = parser.add_mutually_exclusive_group(required=True)
+    what = parser.add_mutually_exclusive_group()
     for option, rows, default in (
         ("--csv", "control periods", _PERIODS),
         ("--readings", "tracker readings", _READINGS),
@@ -58,10 +58,13 @@ def add_parser(commands: Commands) -> None:
         )
 
 
-def _export(args: argparse.Namespace) -> int:
+def export(args: argparse.Namespace) -> int:
+    """Write the CSV file."""
     from flexneedle.record.export import write_csv, write_readings
     from flexneedle.record.loading import load_insertion
 
+    if args.csv is None and args.readings is None:
+        raise InputError("--csv or --readings: one must be given")
     if args.csv is not None:
         write, name, default = write_csv, args.csv, _PERIODS
     else:

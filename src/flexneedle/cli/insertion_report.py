@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flexneedle.cli.common import entry_rows, print_json, print_table, target_row
+from flexneedle.cli.common import clearance_rows, entry_rows, print_json, print_table, target_row
 from flexneedle.cli.progress import print_note
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("  measured", _number(result["residual_mm"], "mm")),
         ("  planned", _number(result["planned_error_mm"], "mm")),
         *_registration(scenario, insertion),
+        *_clearance(scenario, insertion),
         *_invasiveness(insertion),
         ("control periods", str(result["steps"])),
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
@@ -82,6 +83,20 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
         return []
     error = expected_error(scenario.tracker.registration, insertion.target)
     return [("  expected registration error", _number(error, "mm"))]
+
+
+def _clearance(scenario: Scenario, insertion: Insertion) -> Iterator[tuple[str, str]]:
+    """Yield the rows of the least clearance from zones: true, where the true shape is known, estimated and planned."""
+    plan = insertion.plan
+    true = [period.true_shape for period in insertion.periods if period.true_shape is not None]
+    shapes = [period.shape for period in insertion.periods]
+    if true:
+        yield from clearance_rows(scenario, "least true clearance", insertion.true_clearance_mm, true).items()
+    if shapes:
+        yield from clearance_rows(
+            scenario, "least clearance, estimated", insertion.least_clearance_mm, shapes
+        ).items()
+    yield from clearance_rows(scenario, "  planned", plan.least_clearance_mm, plan.shapes).items()
 
 
 def _invasiveness(insertion: Insertion) -> Iterator[tuple[str, str]]:

@@ -24,7 +24,7 @@ from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, Stop
 _CORE = {"plan": plan, "insert": insert, "view": view, "export": export, "scenario": scenario}
 _COLLECT_AFTER = 100_000  # new objects; with Python's 700, collections take a tenth of a short command's time
 _ORDER = (
-    *("plan", "insert", "serve", "study", "report", "view", "export", "scenario"),
+    *("plan", "insert", "serve", "study", "report", "view", "export", "scenario", "image"),
     *("import", "calibrate", "validate", "em", "rig", "emulate"),
 )
 """Order in the help; commands of other packages, and options that a package adds to a command here, come last."""

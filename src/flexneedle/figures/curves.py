@@ -144,6 +144,40 @@ def true_energy(insertion: Insertion) -> Floats:
     return np.array(known, dtype=float).reshape(-1, 2)
 
 
+def estimated_clearance(insertion: Insertion) -> Floats:
+    """Return depth of the estimated tip (mm) and clearance of the estimated needle from zones (mm) (k, 2)."""
+    rows = [(period.estimate.x, period.clearance) for period in insertion.periods]
+    return np.array(rows, dtype=float).reshape(-1, 2)
+
+
+def true_clearance(insertion: Insertion) -> Floats:
+    """Return depth of the true tip (mm) and clearance of the true needle from zones (mm) (k, 2), where known."""
+    known = [
+        (period.true_tip.x, period.true_clearance)
+        for period in insertion.periods
+        if period.true_tip is not None and period.true_clearance is not None
+    ]
+    return np.array(known, dtype=float).reshape(-1, 2)
+
+
+def known_shapes(insertion: Insertion) -> list[Floats]:
+    """Return the true shapes (n, 3) of the needle; if one is unknown, the estimated ones (n, 5)."""
+    true = [period.true_shape for period in insertion.periods if period.true_shape is not None]
+    complete = len(true) == len(insertion.periods)
+    return true if complete else [period.shape for period in insertion.periods]
+
+
+def known_clearance(insertion: Insertion) -> float:
+    """Return the least clearance (mm) of the true needle from zones; if unknown, of the estimated one."""
+    true = insertion.true_clearance_mm
+    return insertion.least_clearance_mm if math.isnan(true) else true
+
+
+def last_shape(insertion: Insertion) -> Floats:
+    """Return points (n, ≥ 3) of the needle at the end: true, or estimated where the true shape is not known."""
+    return known_shapes(insertion)[-1]
+
+
 def intermediate_shapes(tips: Floats, shapes: list[Floats], count: int = 4) -> list[Floats]:
     """Return up to `count` shapes at equal distances of the tip from start to end, without the last one."""
     depth = tips[:, X]

@@ -4,7 +4,7 @@ In space the scene is two sections to the same scale, x–y and x–z, with the 
 tracker that measures its field, a panel over time shows the indicators and the times of holds.
 """
 
-from math import dist
+from math import dist, isfinite
 from textwrap import fill
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.figures import curves, scene, space
+from flexneedle.figures import curves, scene, space, zones
 from flexneedle.figures.labels import name_parts
 from flexneedle.figures.layout import COLUMNS, fit, mosaic, short
 from flexneedle.figures.panels import ENERGY, DepthPanel, Line, draw_depths, draw_timeline
@@ -50,7 +50,8 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         if len(field):
             _field(axes["field"], scenario, insertion, field)
         shown_axes = [*scenes, *(axes[name] for name in axes if name == "along")]
-        below = [", ".join(filter(None, part)) for part in (facts[:-2], facts[-2:]) if is_column()]
+        parts = (facts[:2], facts[2:-2], facts[-2:])
+        below = [", ".join(filter(None, part)) for part in parts if is_column() and part]
         name_parts(figure, scenes, shown_axes, scenario, below)
     return figure
 
@@ -59,7 +60,8 @@ def _panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
     """Return panels over depth by name, from above."""
     roll = {"roll": _roll(insertion)} if scenario.setup.axes == 2 else {}
     deviation, motion = _deviation(scenario, insertion), _motion(scenario, insertion)
-    return {"deviation": deviation, "motion": motion} | roll | {"energy": _energy(insertion)}
+    energy, clearance = {"energy": _energy(insertion)}, _clearance(scenario, insertion)
+    return {"deviation": deviation, "motion": motion} | roll | energy | clearance
 
 
 def _sheet(
@@ -71,7 +73,7 @@ def _sheet(
         heights, widths, tall = [2.4], COLUMNS, 2.8
     else:
         scenes = [[name, name, "along"] for name in ("scene y", "scene z")]
-        ends = ("end y", "end y", "end z", "end z")
+        ends = ["end y", "end y", *["."] * (len(panels) - 4), "end z", "end z"]
         below = [[name, end, end] for name, end in zip(panels, ends, strict=True)]
         heights, widths, tall = [1.6, 1.6], space.COLUMNS, 2.8
     rows = [*scenes, *below, *([["field", *["."] * (len(widths) - 1)]] if field else [])]
@@ -87,9 +89,11 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
     known = [plan.tips, estimated, curves.true_path(insertion), np.array([plan.target])]
     scene.draw_tissue(ax, scenario, known, view)
     before = curves.intermediate_shapes(estimated, [period.shape for period in insertion.periods])
+    zones.draw_zones(ax, scenario, curves.last_shape(insertion), view)
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle", view)
     _paths(ax, insertion, view)
     _rolls(ax, scenario, insertion, view, 4.0)
+    zones.draw_nearest(ax, scenario, curves.known_shapes(insertion), curves.known_clearance(insertion), view)
     scene.draw_target(ax, plan.target, view)
     if scenario.setup.axes == 2 and (period := curves.prediction(insertion)) is not None:
         space.draw_prediction(ax, period, view)
@@ -119,6 +123,7 @@ def _along(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     """Draw the view along the axis: paths of tip and guide, directions of the bevel, target."""
     travel, path = _guide_travel(insertion), _known_path(insertion)
     space.set_up_along(ax, scenario, [insertion.plan.tips, path, travel, np.array([insertion.target])])
+    zones.draw_zones(ax, scenario, curves.last_shape(insertion), scene.ALONG)
     if scenario.setup.has_guide:
         space.draw_guide_along(ax, travel[:, 1:], insertion.target)
     space.draw_along(ax, path, insertion.plan.tips)
@@ -197,6 +202,21 @@ def _energy(insertion: Insertion) -> DepthPanel:
     return DepthPanel(ENERGY, lines, 1.0, peaks=True)
 
 
+def _clearance(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
+    """Return the panel of the clearance from zones, by name; none without zones near the needle."""
+    plan = insertion.plan
+    planned = Line("planned", plan.tips[:, X], plan.clearance, PLAN, "--")
+    estimated, true = (
+        Line(name, rows[:, 0], rows[:, 1], color)
+        for name, rows, color in (
+            ("estimated", curves.estimated_clearance(insertion), ESTIMATE),
+            ("true", curves.true_clearance(insertion), TRUE),
+        )
+    )
+    lines = [line for line in (planned, true, estimated) if zones.has_clearance(line.y)]
+    return {"clearance": zones.clearance_panel(scenario, lines)} if lines and scenario.zone else {}
+
+
 def _field(ax: Axes, scenario: Scenario, insertion: Insertion, field: Floats) -> None:
     """Draw the largest indicator of the references over time, the monitor's limits, and the times of holds."""
     monitor, held = scenario.monitor, curves.held_spans(insertion)
@@ -231,6 +251,7 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) ->
         whole = f"The end{seen}{'' if is_column() else ', magnified'} (mm)"
         ax.set_title(whole if near else f"The tip{seen}, {format_mm(distance)} off")
     scene.tint_layers(ax, scenario)
+    zones.draw_zones(ax, scenario, curves.last_shape(insertion), view, named=False)
     _paths(ax, insertion, view, scale=1.6)
     scene.draw_target(ax, target, view)
     if near and not insertion.hit:
@@ -253,6 +274,8 @@ def _facts(insertion: Insertion) -> list[str]:
     """Return errors, bevel rolls, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     errors = [f"{name} {format_mm(value)}" for name, value in values if not np.isnan(value)]
+    if isfinite(least := curves.known_clearance(insertion)):
+        errors.append(f"least clearance {format_mm(least)}")
     rolls = f"bevel rolls: {insertion.flips} (planned {insertion.plan.flips})"
     phantom = f"{insertion.phantom.rpartition(':')[2]} phantom" if insertion.phantom else ""
     return [

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.figures import curves, scene, space
+from flexneedle.figures import curves, scene, space, zones
 from flexneedle.figures.labels import name_parts
 from flexneedle.figures.layout import fit, mosaic, short
 from flexneedle.figures.panels import ENERGY, DepthPanel, Line, draw_depths
@@ -26,7 +26,9 @@ _ENTRY = np.array([-12.0, 12.0])  # mm; ends of the line along the tip at the sk
 def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     """Return the figure of one or more plans to the same target."""
     roll = {"roll": _roll(plans)} if scenario.setup.axes == 2 else {}
-    panels = {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)}  # from above
+    panels = (
+        {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)} | _clearance(scenario, plans)
+    )
     with apply_style():
         figure, axes = _sheet(scenario, plans, list(panels))
         known = [*(plan.tips for plan in plans), np.array([plans[0].target])]
@@ -56,22 +58,26 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
 def _sheet(scenario: Scenario, plans: Sequence[Plan], panels: list[str]) -> tuple[Figure, dict[str, Axes]]:
     names, first = [plan.strategy for plan in plans], plans[0]
     title = f"{short(scenario.name, 60)}: plan to {scene.place(scenario, first.target)} (seed {first.seed})"
+    taller = 1.15 * ("clearance" in panels)
     if scenario.setup.axes == 1:
         rows = [*((name, name) for name in names), *((panel, "cost") for panel in panels)]
-        return mosaic(title, 3.4 + 2.4 * len(plans), rows, [2.4] * len(plans) + [1.0, 1.0])
+        heights = [2.4] * len(plans) + [1.0] * len(panels)
+        return mosaic(title, 3.4 + 2.4 * len(plans) + taller, rows, heights)
     ends = [(name, end) for name in names for end in scene.sections(scenario)]
     sections = [(name + end, name + end, f"{name} along") for name, end in ends]
     below = [(panel, "cost", "cost") for panel in panels]
     heights = [1.6] * len(ends) + [1.0] * len(panels)
-    return mosaic(title, 4.6 + 3.2 * len(plans), sections + below, heights, space.COLUMNS)
+    return mosaic(title, 4.6 + 3.2 * len(plans) + taller, sections + below, heights, space.COLUMNS)
 
 
 def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str, view: View) -> None:
     before = curves.intermediate_shapes(plan.tips, list(plan.shapes))
+    zones.draw_zones(ax, scenario, plan.shapes[-1], view)
     scene.draw_needle(ax, plan.shapes[-1], before, scenario.needle.outer_diameter, "planned needle", view)
     how: dict[str, Any] = {"color": color, "linewidth": 1.4, "zorder": 5}
     ax.plot(*plan.tips[:, view].T, "--", label=f"planned path, {plan.strategy}", **how)
     space.draw_planned(ax, scenario, plan, view, 4.0)
+    zones.draw_nearest(ax, scenario, plan.shapes, plan.least_clearance_mm, view)
     scene.draw_target(ax, plan.target, view)
     if scenario.setup.guide_x is not None:
         travel = plan.guide[:, view[1] - Y]
@@ -83,6 +89,7 @@ def _draw_along(ax: Axes, scenario: Scenario, plan: Plan, *, single: bool) -> No
     """Draw the view along the axis: paths of tip and guide, directions of the bevel, target."""
     travel = np.column_stack([np.zeros(len(plan.guide)), plan.guide])
     space.set_up_along(ax, scenario, [plan.tips, travel, np.array([plan.target])])
+    zones.draw_zones(ax, scenario, plan.shapes[-1], scene.ALONG)
     if scenario.setup.has_guide:
         space.draw_guide_along(ax, plan.guide, plan.target)
     space.draw_along(ax, plan.tips, scale=not is_column() or single)
@@ -156,6 +163,17 @@ def _energy(plans: Sequence[Plan]) -> DepthPanel:
         for plan, color in zip(plans, STRATEGIES, strict=False)
     ]
     return DepthPanel(ENERGY, lines, 1.0, peaks=True)
+
+
+def _clearance(scenario: Scenario, plans: Sequence[Plan]) -> dict[str, DepthPanel]:
+    """Return the panel of the clearance from zones, by name; none without zones near the plans."""
+    near = [
+        (plan, color)
+        for plan, color in zip(plans, STRATEGIES, strict=False)
+        if zones.has_clearance(plan.clearance)
+    ]
+    lines = [Line(plan.strategy, plan.tips[:, X], plan.clearance, color) for plan, color in near]
+    return {"clearance": zones.clearance_panel(scenario, lines)} if lines and scenario.zone else {}
 
 
 def _write_terms(ax: Axes, plans: Sequence[Plan], names: Sequence[str]) -> None:

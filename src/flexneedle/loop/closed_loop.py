@@ -117,8 +117,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         ending = _ending(task, state)
         period = _make_period(index, now, task, rig, step, motion.control, observation, clocks)
         warning = warn_of_miss(step.decision, state.in_a_row) or step.decision.doubt
-        clearance = steering.guard.zones.clearance_of(observation.estimate.state)
-        yield replace(period, warning=warning, clearance=clearance), ending
+        yield replace(period, warning=warning, **_clearances(steering, period, observation)), ending
         if ending is not None:
             return
 
@@ -260,6 +259,15 @@ def _make_period(
         },
         converged=state.converged and (truth is None or truth.converged),
     )
+
+
+def _clearances(steering: Steering, period: Period, observation: Observation) -> dict[str, Any]:
+    """Return the fields of a period with the clearances from zones."""
+    zones, true = steering.guard.zones, period.true_shape
+    return {
+        "clearance": zones.clearance_of(observation.estimate.state),
+        "true_clearance": None if true is None else float(zones.shape_clearances(true)),
+    }
 
 
 def _pair(miss: float | complex) -> Lateral:

@@ -23,8 +23,10 @@ _WAYS = 16  # that are simulated
 _RACED = 3
 _ROUNDS = 2
 _FAR_BEHIND_MM = 30.0  # cost of a way behind the best, beyond which it is not raced
+_REFINED = 12  # iterations of a search for more clearance
 _HOPELESS_MM = 60.0  # cost of the best of a race that no other way is expected to mend: in a margin by 1 mm
-_LAPS = 6  # iterations of each in a race
+_LOST_MM = 150.0  # cost after a race that the search is not expected to mend
+_LAPS = 4  # iterations of each in a race
 _ENTRY_SIGMA = 0.05  # of the bounds: ways are closer to their end than a first sample
 _TO_TARGET = 0.95  # correlation of point and slope, so that the path still ends near the target
 _BEVEL_SIGMA = 0.5  # of that of a search without zones: a way has its rolls
@@ -48,7 +50,8 @@ def search_detours(
     costs = evaluate_cost(problem.terms, rollout(make_controls(problem, z)[0]))
     order = np.argsort(costs, kind="stable")
     laps, done = replace(search, iterations=_LAPS), 0
-    search = replace(search, iterations=min(search.iterations, 2 * (search.usual or search.iterations)))
+    usual = search.usual or search.iterations
+    search = replace(search, iterations=min(search.iterations, 2 * usual))
     for first in range(0, min(len(order), _ROUNDS * _RACED), _RACED):
         raced: list[Found] = []
         near = costs[order] <= costs[order[first]] + _FAR_BEHIND_MM
@@ -59,7 +62,7 @@ def search_detours(
             raced.append(one)
             done += one.search_state.iterations
         one = min(raced, key=lambda each: each.cost)
-        if not one.search_state.converged:
+        if not one.search_state.converged and one.cost <= _LOST_MM:
             shown = count_iterations(progress, done, done + search.iterations, one.cost)
             about, begun = variables_about(problem, one.z), one.search_state
             one = find_best(about, rollout, problem.terms, search, rng, progress=shown, begun=begun)
@@ -67,6 +70,20 @@ def search_detours(
         yield make_solution(problem, one)
         if one.cost > _HOPELESS_MM:
             return
+
+
+def refine(
+    rollout: RolloutFunction,
+    problem: PlanProblem,
+    solution: Solution,
+    search: Search,
+    rng: np.random.Generator,
+    progress: OnIteration,
+) -> Solution:
+    """Return the solution of a problem that differs a little from that of a solution."""
+    about = variables_about(problem, solution.search_state.best)
+    search = replace(search, iterations=_REFINED, usual=_REFINED)
+    return make_solution(problem, find_best(about, rollout, problem.terms, search, rng, progress=progress))
 
 
 def variables_about(problem: PlanProblem, z: Floats) -> Variables:

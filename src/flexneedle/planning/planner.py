@@ -15,7 +15,7 @@ from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories, o
 from flexneedle.errors import InputError
 from flexneedle.planning import STRATEGIES
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.detours import search_detours
+from flexneedle.planning.detours import refine, search_detours
 from flexneedle.planning.entry import mounted_axes, with_entry
 from flexneedle.planning.events import Iterated, Listener, send_event
 from flexneedle.planning.freedom import find_freedom
@@ -23,6 +23,7 @@ from flexneedle.planning.horizon import OnIteration, count_iterations
 from flexneedle.planning.limit import find_largest_load, find_limit
 from flexneedle.planning.primitives import Solution, fix_guide, search_primitives, widen_search
 from flexneedle.planning.problem import PlanProblem, make_problem
+from flexneedle.planning.second_opinion import exact_clearances
 from flexneedle.planning.steering import MOST_ROLLS, reach, search_rolls
 from flexneedle.planning.ways import Room
 from flexneedle.results import TARGET_RADIUS_MM, Plan, format_mm
@@ -43,6 +44,9 @@ _PRECISE_MM = 0.1  # miss of a plan above which other searches are made
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
 _RESERVE_MM = 0.1  # of clearance in a search, beyond the margin
+_REPEATS = 2  # of a search with more clearance, where the exact rod enters a margin
+_MENDED_MM = 1.5  # largest intrusion for which it is repeated
+_CLEAR_MM = 5.0  # cost of the margins of a plan that nearly keeps them by the simulator
 _OVERLOAD_MM = 10.0  # rank of a load beyond a limit of the guard
 _OUTPUTS = ("energy", "stretch", "strain", "loads", "shapes", "clearance")
 _ENOUGH_ROLLS = 1  # to reach a target, though not at the least cost
@@ -115,21 +119,21 @@ def _avoid(
     plan, needle = simulator.scenario.plan, simulator.scenario.needle
     around = replace(problem, clear=zones.margin + _RESERVE_MM, length=needle.length_mm)
     shapes_of, room = _make_rollout(simulator, (), at_end=("shapes",)), make_room(simulator.scenario, zones)
-    solutions = search_detours(
-        _make_rollout(simulator, around.terms),
-        shapes_of,
-        around,
-        room,
-        _search_settings(plan, plan.samples),
-        rng,
-        count_iterations(progress, found.iterations, found.iterations + plan.iterations, np.inf),
-    )
+    rollout, search = _make_rollout(simulator, around.terms), _search_settings(plan, plan.samples)
+    after = count_iterations(progress, found.iterations, found.iterations + plan.iterations, np.inf)
+    solutions = search_detours(rollout, shapes_of, around, room, search, rng, after)
     best, history = found, found.history
     for solution in solutions:
-        new = _carry_out(simulator, problem, found.strategy, found.seed, solution)
-        history = (*history, *new.history)
-        best = min(best, new, key=_rank)
-        if best.hit and not best.intrusion_mm and best.error_mm <= _PRECISE_MM:
+        for repeat in range(1 + _REPEATS):
+            new = _carry_out(simulator, problem, found.strategy, found.seed, solution)
+            history = (*history, *new.history)
+            best = min(best, new, key=_rank)
+            near = 0.0 < new.intrusion_mm <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
+            if repeat == _REPEATS or not near:
+                break
+            farther = replace(around, clear=zones.margin + _RESERVE_MM + (1 + repeat) * new.intrusion_mm)
+            solution = refine(rollout, farther, solution, search, rng, progress)
+        if best.hit and best.error_mm <= _PRECISE_MM:
             break
     best = replace(best, history=history, iterations=len(history))
     if best.hit:
@@ -267,25 +271,35 @@ def _carry_out(
 
 
 def _measure_clearance(plan: Plan, simulator: Simulator, start: State, searched: Floats) -> Plan:
-    """Return a plan with its clearance, and with a refusal if it enters a margin.
+    """Return a plan with its clearance by the simulator and by the exact rod, and with a refusal if it enters a margin.
 
     searched (m,): clearance after each step, as a search compares it.
     """
-    zones = zones_of(simulator.scenario)
-    if not zones:
+    scenario, rows = simulator.scenario, plan.controls
+    if not (zones := zones_of(scenario)):
         return replace(plan, clearance=np.full(len(plan.tips), np.inf))
-    exact = (
-        simulator.with_zones(zones.exact).rollout(start, plan.controls[None], outputs="clearance").clearance
-    )
-    clearance = np.append(np.inf, np.where(plan.tips[1:, X] > 0.0, exact[0], np.inf))
-    intrusion, worst = max(0.0, zones.margin - float(searched.min())), int(searched.argmin())
-    plan = replace(plan, clearance=clearance, intrusion_mm=intrusion)
-    if not intrusion or plan.refusal:
+    least = simulator.with_zones(zones.exact).rollout(start, rows[None], outputs="clearance").clearance[0]
+    inside = zones.margin - float(searched.min())
+    deepest = zones.clearances(simulator.replay(start, rows[: searched.argmin() + 1])[0].body)
+    if inside <= 0.0:  # the exact rod takes longer
+        exact = exact_clearances(scenario, zones, rows, plan.roll)
+        least, deepest = np.minimum(least, exact.min(axis=0)), exact
+        inside = float((zones.margins[:, None] - exact).max())
+    clearance = np.append(np.inf, np.where(plan.tips[1:, X] > 0.0, least, np.inf))
+    plan = replace(plan, clearance=clearance, intrusion_mm=max(0.0, inside))
+    if not plan.intrusion_mm or plan.refusal:
         return plan
-    near = zones.nearest(simulator.replay(start, plan.controls[: worst + 1])[0].body)
-    where = "from" if near.clearance >= 0.0 else "inside"
-    refusal = f"{format_mm(abs(near.clearance))} {where} zone {near.zone} (margin {near.margin:g} mm)"
+    refusal = _describe_intrusion(zones, deepest)
     return replace(plan, refusal=refusal, limit=f"zones.margin_mm = {zones.margin:g}")
+
+
+def _describe_intrusion(zones: ZoneMap, clearances: Floats) -> str:
+    """Return the clearance, of some (z, n), that is deepest in its margin."""
+    least = clearances.min(axis=1, initial=np.inf)
+    worst = int((least - zones.margins).argmin())
+    where = "from" if least[worst] >= 0.0 else "inside"
+    distance, margin = format_mm(abs(float(least[worst]))), zones.margins[worst]
+    return f"{distance} {where} zone {zones.names[worst]} (margin {margin:g} mm)"
 
 
 def _fix_entry(

@@ -81,10 +81,12 @@ def find_ways(
     Entries are on a grid, the guide's motions random. rollout: with the shapes at the end.
     """
     responses = Responses.of(rollout, problem)
-    found = [responses.at_entries()]
+    ways = responses.at_entries()
+    costs = rate(problem, ways, room)
+    rated = [(ways, costs)]
     if responses.columns:
-        found.append(responses.with_guide(found[0], rate(problem, found[0], room), rng))
-    rated = [(way, rate(problem, way, room)) for way in found]
+        moved = responses.with_guide(ways, costs, rng)
+        rated.append((moved, rate(problem, moved, room)))
     return _choose(rated, count)
 
 

@@ -129,6 +129,11 @@ def _relative(energy: float | None, period: Period) -> Message | None:
     return number(energy / period.energy_scale) if energy is not None and period.energy_scale > 0.0 else None
 
 
+def _distance(clearance: float | None) -> Message | None:
+    """Return a clearance (mm) in m; None without zones, or if it is not known."""
+    return None if clearance is None or not isfinite(clearance) else number(clearance * 1e-3)
+
+
 def _joint_states(period: Period) -> Message:
     return joints(period.time, (*period.base, *period.guide, period.roll))
 
@@ -245,6 +250,16 @@ FIELDS: dict[str, PeriodField] = {
     ),
     "stretch": PeriodField(_numbers("stretch")),
     "true_stretch": PeriodField(_numbers("true_stretch")),
+    "clearance": PeriodField(
+        _numbers("clearance_mm"),
+        topics=(Topic("/needle/clearance", _NUMBER, lambda one: _distance(one.clearance)),),
+        page=("clearance_mm",),
+    ),
+    "true_clearance": PeriodField(
+        _numbers("true_clearance_mm"),
+        topics=(Topic("/needle/true_clearance", _NUMBER, lambda one: _distance(one.true_clearance)),),
+        page=("true_clearance_mm",),
+    ),
     "converged": PeriodField((("converged", _flag),)),
     "readings": PeriodField(page=("indicator", _largest_indicator)),
     "durations": PeriodField(page=("decide_ms", lambda one, _: 1e3 * one.durations.get("decide", 0.0))),
@@ -252,7 +267,12 @@ FIELDS: dict[str, PeriodField] = {
 """Fields of `Period` by name, in the order of the columns. `true_…` are of the virtual phantom, which no controller
 knows. `record.topics` has durations and readings."""
 
-_ADDED = {"stretch": "nan", "energy_scale_mj": "nan"}  # columns that older traces lack
+_ADDED = {
+    "stretch": "nan",
+    "energy_scale_mj": "nan",
+    "clearance_mm": "inf",
+    "true_clearance_mm": "",
+}  # columns that older traces lack
 
 COLUMNS: tuple[str, ...] = tuple(name for field in FIELDS.values() for name, _ in field.columns)
 """Names of the columns, in order."""

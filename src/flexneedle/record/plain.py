@@ -6,7 +6,7 @@ Numbers keep all digits. NaN and infinity, which JSON does not have, become null
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from flexneedle.results import Plan
 from flexneedle.types import COLUMNS
 
-_ARRAYS = ("controls", "tips", "strain_energy", "least_stretch", "guide", "shapes")
+_ARRAYS = ("controls", "tips", "strain_energy", "least_stretch", "clearance", "guide", "shapes")
 _STORED_ELSEWHERE = ("seconds", "scenario", "versions")
 
 
@@ -42,7 +42,8 @@ def plan_values(plan: Plan) -> dict[str, Any]:
 
 def plan_from_values(values: Mapping[str, Any]) -> Plan:
     """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError for other values."""
-    values = {"least_stretch": [nan], **values}  # older files have none
+    values = {"least_stretch": [nan], "clearance": [inf], **values}  # older files have none
+    values["clearance"] = [inf if each is None else each for each in values["clearance"]]
     given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
     given["controls"] = given["controls"].reshape(-1, len(COLUMNS))
     x, y, z = values["target"]

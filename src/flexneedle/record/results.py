@@ -37,6 +37,7 @@ RESULT_KEYS = (
         "energy_scale_uj",
         "energy_estimated",
     ),
+    *("clearance_mm", "true_clearance_mm", "planned_clearance_mm"),
     *("steps", "held_s", "converged", "seed"),
 )
 """Keys of the result of an insertion, in order."""
@@ -172,6 +173,9 @@ RESULT_COLUMNS: dict[str, ResultColumn] = {
     },
     **{f"planned_{name}": ResultColumn(float, of_plan=partial(_load, name=name)) for name in LOAD},
     "planned_error_mm": ResultColumn(float, of_plan=lambda plan: plan.error_mm),
+    "clearance_mm": ResultColumn(float, of_insertion=lambda i: i.least_clearance_mm),
+    "true_clearance_mm": ResultColumn(float, of_insertion=lambda i: i.true_clearance_mm),
+    "planned_clearance_mm": ResultColumn(float, of_plan=lambda plan: plan.least_clearance_mm),
     "periods": ResultColumn(int, of_insertion=lambda i: len(i.periods)),
     "planned_periods": ResultColumn(int, of_plan=lambda plan: len(plan.controls)),
     "held_s": ResultColumn(float, of_insertion=lambda i: i.held_s),
@@ -185,6 +189,8 @@ RESULT_COLUMNS: dict[str, ResultColumn] = {
     "reason": ResultColumn(str, of_insertion=lambda i: i.reason),
 }
 """Columns of the results of an insertion in the table of a study, in order.
+
+clearance_mm: least clearance of the estimated needle from the zones to avoid, infinite without zones.
 
 predicted_…: lateral miss predicted by the controller with the tip at that fraction of the target depth, and its
 standard deviation; predicted_…_sds: deviation from this prediction, in standard deviations, of the final true tip and
@@ -221,6 +227,7 @@ def plan_result(plan: Plan) -> dict[str, Any]:
             "flips": plan.flips,
             "strain_energy_mj": plan.strain_energy_mj,
             **{name: _load(plan, name) for name in (*LOAD, "energy_scale_uj")},
+            "clearance_mm": plan.least_clearance_mm,
             "iterations": plan.iterations,
             "converged": bool(plan.converged),
             "seed": plan.seed,

@@ -31,6 +31,7 @@ GROUP = "flexneedle.images"
 `Workspace` to a `DistanceGrid`, or None where the zone is out of reach."""
 _SMALL_MM = 1e-4  # for slopes of distances
 _BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
+_STEEP = 0.05  # by which the distance of two contacts may exceed their spacing
 _ANYWHERE_MM = 1e6
 _NOWHERE_MM = -1e9
 _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
@@ -39,12 +40,14 @@ _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond t
 class Workspace(NamedTuple):
     """The region of the insertion frame that the needle may reach: its corners (3,), mm.
 
-    far: distance (mm) up to which distances in it are wanted.
+    far: distance (mm) up to which distances in it are wanted; near: the least distance (mm) of the needle's axis from a
+    zone that is wanted in a plan, from which on distances must not be too large.
     """
 
     low: Floats
     high: Floats
     far: float
+    near: float
 
 
 class DistanceGrid(NamedTuple):
@@ -85,6 +88,7 @@ class ZoneMap:
         packed: The zones for searches, larger by what is added and by the difference of their margins.
         exact: The zones for results, larger by what is added, with distances at any distance.
         radius: Radius of the needle (mm).
+        spacing: Largest distance (mm) between two points of the needle for which clearances are bounds.
     """
 
     names: tuple[str, ...]
@@ -94,20 +98,44 @@ class ZoneMap:
     packed: kernels.Zones
     exact: kernels.Zones
     radius: float
+    spacing: float
 
     def __bool__(self) -> bool:
         return bool(self.names)
+
+    @property
+    def kept(self) -> Floats:
+        """Distances (z,), mm, from the zones that the axis of the needle keeps with the margins."""
+        return self.margins + self.added + self.radius
 
     def clearances(self, points: Floats) -> Floats:
         """Return the clearances (z, …), mm, of the needle's surface at points (…, 3) of its axis; they are bounds.
 
         Points before the skin are clear: infinite.
         """
+        return np.where(points[..., 0] <= 0.0, np.inf, self._bounds(points) - self.radius)
+
+    def shape_clearances(self, shapes: Floats) -> Floats:
+        """Return the least clearance (…), mm, of each shape (…, n, ≥ 3) of the needle; it is a bound."""
+        found: Floats = self.clearances(self._refine(shapes)).min(axis=(0, -1), initial=np.inf)
+        return found
+
+    def _refine(self, shapes: Floats) -> Floats:
+        """Return points (…, m, 3) of shapes (…, n, ≥ 3), as near to each other as the bound on their sag assumes."""
+        nodes = shapes[..., :3]
+        steps = np.diff(nodes, axis=-2)[..., None, :]
+        parts = max(1, math.ceil(np.linalg.norm(steps, axis=-1).max(initial=0.0) / self.spacing - _STEEP))
+        between = nodes[..., :-1, None, :] + np.arange(parts)[:, None] / parts * steps
+        return np.concatenate([between.reshape(*nodes.shape[:-2], -1, 3), nodes[..., -1:, :]], axis=-2)
+
+    def distances(self, points: Floats) -> Floats:
+        """Return the distances (z, …), mm, of points (…, 3) from the zones as in the scenario, negative inside."""
+        return self._bounds(points) + self.added.reshape(-1, *(1 for _ in points.shape[:-1]))
+
+    def _bounds(self, points: Floats) -> Floats:
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         found = np.empty((len(self.names), len(flat)))
         kernels.fill_distances(self.exact, flat, found)
-        found -= self.radius
-        found[:, flat[:, 0] <= 0.0] = np.inf
         return found.reshape(len(self.names), *points.shape[:-1])
 
     def least_clearances(self, points: Floats) -> Floats:
@@ -128,12 +156,27 @@ class ZoneMap:
         """
         found = self.clearances(points)
         zone, at = np.unravel_index(int((found - self.margins[:, None]).argmin()), found.shape)
-        here = points[at]
+        return self._nearest(int(zone), points[at], float(found[zone, at]))
+
+    def closest(self, shapes: Floats, recorded: float = math.inf) -> "Nearest | None":
+        """Return where shapes (…, n, ≥ 3) of the needle have their least clearance; None if none is in tissue.
+
+        recorded: clearance (mm) of the result, known from the contacts, which are finer than shapes.
+        """
+        points = self._refine(shapes).reshape(-1, 3)
+        found = self.clearances(points)
+        if not np.isfinite(found).any():
+            return None
+        zone, at = np.unravel_index(int(found.argmin()), found.shape)
+        near = self._nearest(int(zone), points[at], float(found[zone, at]))
+        return near._replace(clearance=recorded) if math.isfinite(recorded) else near
+
+    def _nearest(self, zone: int, here: Floats, clearance: float) -> "Nearest":
+        """Return a point (3,) of the axis, its clearance (mm) from a zone, and the point of the zone."""
         ends = here + _SMALL_MM * np.concatenate([np.eye(3), -np.eye(3)])
         around = np.empty((len(self.names), 6))
         kernels.fill_distances(self.exact, ends, around)
         slope = (around[zone, :3] - around[zone, 3:]) / (2.0 * _SMALL_MM)
-        clearance = float(found[zone, at])
         touched = here - (clearance + self.added[zone] + self.radius) * slope
         return Nearest(self.names[zone], clearance, float(self.margins[zone]), here, touched)
 
@@ -143,7 +186,7 @@ def zones_of(scenario: Scenario) -> ZoneMap:
     if not scenario.zone:
         return NO_ZONES
     files = tuple(_stamp(zone) for zone in scenario.zone if isinstance(zone, sections.ZoneFile))
-    workspace, spacing = _workspace(scenario), scenario.contact.spacing_mm
+    workspace, spacing = workspace_corners(scenario), scenario.contact.spacing_mm
     return _zones_of(
         scenario.zone,
         scenario.zones,
@@ -171,13 +214,13 @@ def _zones_of(
     always = sections.REGISTRATION_SDS * image.sd_mm + sag(spacing, least + radius)
     far = float(margins.max()) + always + radius + _BEYOND_MM
     low, high = map(np.array, corners)
-    workspace = Workspace(low, high, far)
+    workspace = Workspace(low, high, far, least + radius)
     made = [_SHAPES[type(zone)](zone, image, workspace) for zone in zones]
     shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
     packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
     rows = kernels.pack(shapes, _ANYWHERE_MM, added).rows
     exact = kernels.Zones(rows, packed.fields, _ANYWHERE_MM)
-    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, exact, radius)
+    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, exact, radius, spacing)
 
 
 def sag(spacing: float, distance: float) -> float:
@@ -208,7 +251,7 @@ def _digest_of(path: Path, _stamp: tuple[int, int]) -> str:
     return digest_of(path)
 
 
-def _workspace(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the corners of what the needle may reach below the skin."""
     entry, setup, depth = scenario.entry, scenario.setup, scenario.setup.max_depth
     steep = abs(entry.slope) + 1e-3 * entry.free_slope_mrad
@@ -259,5 +302,5 @@ _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {
     sections.ZoneFile: _file,
 }
 
-NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, kernels.NO_ZONES, 0.0)
+NO_ZONES = ZoneMap((), 0.0, np.empty(0), np.empty(0), kernels.NO_ZONES, kernels.NO_ZONES, 0.0, 1.0)
 """The map of a scenario without zones."""

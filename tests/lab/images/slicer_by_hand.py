@@ -11,11 +11,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from flexneedle import load_scenario, plan
 from flexneedle.geometry.quaternion import from_vector, to_matrix
 from flexneedle.geometry.rigid import Rigid
+from flexneedle.lab.images.example import write_example
 from flexneedle.lab.images.label_map import LabelMap, Segment
 from flexneedle.lab.images.markups import ControlPoint, Markup, read_markups, write_markups
 from flexneedle.lab.images.meshes import SUFFIXES, Mesh, read_mesh, write_mesh
+from flexneedle.lab.images.slicer_scene import write_scene
 from flexneedle.lab.images.transforms import read_transform, write_transform
 from flexneedle.lab.images.volumes import read_label_map, write_label_map
 
@@ -173,6 +176,59 @@ def check_segmentation(folder):
         yield f"scene, voxels of {segment.name} in {back.name}", apart(ours, theirs), EXACT
 
 
+def check_export(folder):
+    """Yield checks of an exported plan in 3D Slicer's scene: curves, models, and the transform between the frames."""
+    import vtk
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    w, x, y, z = from_vector(np.array([0.3, -0.4, 0.5])).tolist()
+    scenario = load_scenario("phantom3d").with_values(
+        {
+            "image.rotation": [w, x, y, z],
+            "image.translation_mm": [30.0, -120.0, 15.0],
+            "zone": [{"shape": "sphere", "name": "vessel", "center_mm": [30.0, 20.0, 0.0], "radius_mm": 4.0}],
+            **dict.fromkeys(("plan.samples", "plan.iterations", "plan.max_iterations"), 32),
+        }
+    )
+    made = plan(scenario, threads=1)
+    to_image = Rigid(to_matrix(np.array([w, x, y, z])), np.array([30.0, -120.0, 15.0])).inverse()
+    for path in write_scene({"manipulation": made}, folder / "export"):
+        if path.name.endswith(".mrk.json"):
+            (ours,) = read_markups(path)
+            _scene, node, _back = load(
+                f"vtkMRMLMarkups{ours.kind}Node", "vtkMRMLMarkupsJsonStorageNode", path
+            )
+            theirs = [node.GetNthControlPointPosition(k) for k in range(node.GetNumberOfControlPoints())]
+            yield f"scene, points of {path.name}", apart(ours.positions, theirs), EXACT
+            if path.name == "entry-and-target.mrk.json":
+                yield "scene, target", apart(to_image.apply(np.array(made.target)), theirs[1]), EXACT
+        elif path.suffix == ".ply":
+            _scene, node, _back = load("vtkMRMLModelNode", "vtkMRMLModelStorageNode", path)
+            points = vtk_to_numpy(node.GetPolyData().GetPoints().GetData())
+            ours = read_mesh(path).points
+            yield f"scene, extent of {path.name}", apart(np.ptp(ours, axis=0), np.ptp(points, axis=0)), SINGLE
+            yield f"scene, place of {path.name}", apart(ours.min(axis=0), points.min(axis=0)), SINGLE
+        else:
+            _scene, node, _back = load("vtkMRMLLinearTransformNode", "vtkMRMLTransformStorageNode", path)
+            matrix = vtk.vtkMatrix4x4()
+            node.GetMatrixTransformToParent(matrix)
+            expected = np.column_stack([to_image.rotation, to_image.translation])
+            yield f"scene, matrix of {path.name}", apart(expected, elements(matrix)[:3]), EXACT
+
+
+def check_example(folder):
+    """Yield checks of the synthetic abdomen in 3D Slicer's scene: voxels of each segment and points."""
+    label_path, points_path, _case = write_example(folder / "abdomen", 0, (2.0, 2.0, 2.0))
+    _scene, _node, back = load("vtkMRMLSegmentationNode", "vtkMRMLSegmentationStorageNode", label_path)
+    ours, theirs = read_label_map(label_path), read_label_map(back)
+    for segment in ours.segments:
+        found = places(theirs, theirs.find_segment(segment.name))
+        yield f"scene, voxels of {segment.name} in {back.name}", apart(places(ours, segment), found), EXACT
+    _scene, node, _back = load("vtkMRMLMarkupsFiducialNode", "vtkMRMLMarkupsJsonStorageNode", points_path)
+    theirs = [node.GetNthControlPointPosition(k) for k in range(4)]
+    yield "scene, points of the abdomen", apart(read_markups(points_path)[0].positions, theirs), EXACT
+
+
 def places(image, segment):
     """Return the centres (n, 3) of the voxels of a segment, RAS (mm), in one order for all files."""
     rows = np.argwhere(image.mask(segment)) @ image.affine[:3, :3].T + image.affine[:3, 3]
@@ -189,6 +245,8 @@ def main():
             ("slicer", "slicer-core", check_transform),
             ("slicer", "slicer-core", check_meshes),
             ("slicer", "slicer-core", check_segmentation),
+            ("slicer", "slicer-core", check_export),
+            ("slicer", "slicer-core", check_example),
         ):
             if find_spec(module) is None:
                 missing.add(package)

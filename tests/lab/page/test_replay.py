@@ -51,7 +51,7 @@ def kinds(record):
 def test_the_record_is_equal_to_the_reports_of_a_worker(file):
     made = insertion()
     assert file.record == as_sent(record())
-    assert kinds(record()) == ["insertion", "PATH", "NEEDLE", "TRUE", "rows"]
+    assert kinds(record()) == ["insertion", "zones", "PATH", "NEEDLE", "TRUE", "rows"]
     assert file.record[0]["load"] == made.invasiveness.rows()
     path, needles, true = (unpack_frame(each) for each in file.record if isinstance(each, bytes))
     assert {frame.source for frame in (path, needles, true)} == {FrameSource.FIRST}
@@ -65,7 +65,7 @@ def test_the_record_is_equal_to_the_reports_of_a_worker(file):
 def test_unknown_values_are_null_and_have_no_shapes():
     made = insertion()
     made = replace(made, periods=tuple(blind(period) for period in made.periods))
-    assert kinds(record(made)) == ["insertion", "PATH", "NEEDLE", "rows"]
+    assert kinds(record(made)) == ["insertion", "zones", "PATH", "NEEDLE", "rows"]
     *_, rows = File.of(make_document("mine", record(made))).record
     unknown = ("measured", "true", "true_energy_uj", "miss_sd_mm")
     assert {tuple(row[key] for key in unknown) for row in rows["rows"]} == {(None,) * 4}

@@ -55,8 +55,9 @@ def test_the_file_is_written_beside_the_record_or_to_a_given_path(capsys, in_tmp
 
 def test_a_run_is_named_by_its_folder_and_two_are_compared(capsys, in_tmp, monkeypatch):
     _, messages = replay(capsys, "one")
-    assert [(each["type"], each["of"]) for each in messages] == [("insertion", "first"), ("rows", "first")]
-    assert (messages[0]["name"], messages[0]["state"], len(messages[1]["rows"])) == ("one", "done", 69)
+    kinds = ("insertion", "zones", "rows")
+    assert [(each["type"], each["of"]) for each in messages] == [(kind, "first") for kind in kinds]
+    assert (messages[0]["name"], messages[0]["state"], len(messages[-1]["rows"])) == ("one", "done", 69)
     file, messages = replay(capsys, "one", "--compare", "two")
     shown = [(each["of"], each["name"], each["seed"]) for each in messages if each["type"] == "insertion"]
     assert shown == [("first", "one", 0), ("second", "two", 1)]

@@ -21,10 +21,13 @@ from flexneedle.lab.ros.composer import (
 )
 from flexneedle.lab.ros.profile import PUBLISHED, load_profile
 from flexneedle.lab.ros.records import JointTargets
+from flexneedle.lab.ros.zones import make_clearance, make_zones
 from flexneedle.record.messages import STORE, pose
 from flexneedle.record.writer import TraceWriter
+from flexneedle.simulator.zones import NO_ZONES, zones_of
 from flexneedle.types import Measurement, Pose, Shape
 from synthetic import blind, make_periods, make_plan
+from zoned import HALF_SPACE, SPHERE, with_zones
 
 PLAN = replace(make_plan(), scenario=flexneedle.load_scenario("phantom"))
 PERIODS = [
@@ -202,6 +205,45 @@ def test_markers_are_the_layers_and_the_target():
     assert [m.ns for m in sent] == ["tissue", "tissue", "target"], "a new target keeps the layers"
     np.testing.assert_allclose(xyz(sent[-1].pose.position), (0.035, -0.004, 0.001))
     assert [m.ns for m in composed(replace(PLAN, scenario=None))["markers"].markers] == ["target"]
+
+
+ZONED = with_zones("phantom3d", SPHERE, HALF_SPACE)
+STRAIGHT = replace(
+    PERIOD, clearance=5.5, shape=np.pad(np.arange(-60.0, 40.5, 0.5)[:, None], ((0, 0), (0, 4)))
+)
+
+
+@pytest.mark.parametrize(("profile", "unit"), [("neutral", 1e-3), ("smartneedle", 1.0)])
+def test_zones_and_their_margins_are_triangles_in_the_axes_of_the_topic(profile, unit):
+    sent = composed(make_zones(ZONED), profile=profile)["zones"].markers
+    assert [(m.ns, m.text, m.type) for m in sent] == [
+        (ns, name, 11) for name in ("node", "bone") for ns in ("zones", "margins")
+    ]
+    assert len({m.id for m in sent}) == 4
+    (first, *_), kept = sent, zones_of(ZONED).kept[0]
+    assert (first.scale.x, first.scale.y, first.scale.z) == (1.0, 1.0, 1.0)
+    center = np.array(SPHERE["center_mm"])
+    for marker, radius in zip(sent, (3.0, 3.0 + kept), strict=False):
+        points = np.array([xyz(point) for point in marker.points]) / unit
+        assert len(points) % 3 == 0
+        np.testing.assert_allclose(np.linalg.norm(points - center, axis=1), radius, atol=0.05)
+        np.testing.assert_allclose(xyz(marker.pose.position), 0.0)
+    expected = load_profile(profile).frames[load_profile(profile).publish.zones.frame].rotation
+    np.testing.assert_allclose(matrix_of(first.pose.orientation), expected, atol=1e-12)
+
+
+def test_the_clearance_is_a_line_to_the_nearest_zone_with_a_text():
+    zones = zones_of(ZONED)
+    sent = composed(make_clearance(zones, STRAIGHT))["clearance"].markers
+    line, text = sent
+    np.testing.assert_allclose(
+        [xyz(point) for point in line.points], [[0.025, 0, 0], [0.025, 0.006, 0]], atol=1e-6
+    )
+    assert (line.type, text.type, text.text) == (5, 9, "5.50 mm to node")
+    assert line.header.stamp == composed(STRAIGHT)["tip"].header.stamp
+    before = replace(STRAIGHT, shape=STRAIGHT.shape - [100.0, 0.0, 0.0, 0.0, 0.0])
+    assert make_clearance(zones, before) is None
+    assert make_clearance(NO_ZONES, STRAIGHT) is None
 
 
 def test_the_state_is_a_word_and_a_diagnostic_and_targets_of_joints_are_joint_states():

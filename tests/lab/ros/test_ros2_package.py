@@ -81,7 +81,7 @@ def test_rviz_shows_topics_of_the_neutral_profile_by_their_types():
     assert config["Global Options"]["Fixed Frame"] == NEUTRAL.frames["skin"].id
     keys = {topic.topic: key.removeprefix("publish.") for key, topic in NEUTRAL.list_topics()}
     shown = [display for display in config["Displays"] if "Topic" in display]
-    assert len(shown) == 6
+    assert len(shown) == 8
     for display in shown:
         key = keys[display["Topic"]["Value"]]
         assert PUBLISHED[key] == DISPLAYS[display["Class"].rpartition("/")[2]]

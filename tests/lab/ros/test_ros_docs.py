@@ -40,7 +40,7 @@ def test_the_page_names_each_topic_of_smartneedle():
     topics = [
         topic.topic.removeprefix("/flexneedle/") for _, topic in load_profile("smartneedle").list_topics()
     ]
-    assert len(topics) == 15
+    assert len(topics) == 17
     assert [topic for topic in topics if f"`{topic}`" not in PAGE and f"/{topic}`" not in PAGE] == []
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import load_named
 from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import port
 from flexneedle.errors import InputError
@@ -45,6 +46,7 @@ def add_parser(commands: Commands) -> None:
         default="phantom",
         help="preset name, wide:NUMBER, world:NUMBER or path of the scenario to begin with (default: phantom)",
     )
+    parser.set_defaults(load=load_named, image=None)
     parser.add_argument(
         "--rig",
         metavar="FILE",
@@ -101,9 +103,8 @@ def _setup(args: argparse.Namespace) -> PageSetup:
     from flexneedle.lab.page.server.clients import RIG_LIMITS, PageLimits
     from flexneedle.lab.page.server.page_session import PageSession
     from flexneedle.lab.page.server.request_handler import PageSetup
-    from flexneedle.scenario.files import load_scenario
 
-    session = PageSession.of(Path(args.scenario).name, load_scenario(args.scenario))
+    session = PageSession.of(Path(args.image or args.scenario).name, args.load(args))
     rig = None if args.rig is None else _load_rig(args.rig)
     plans, igtl = "plans" if rig is None else "plans-beside-a-rig", igtl_settings(args)
     if igtl is not None:

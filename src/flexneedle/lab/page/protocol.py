@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.zones import Zone
 
 Strategy = Literal["manipulation", "steering"]
 Recording = Literal["first", "second"]
@@ -116,6 +117,7 @@ class SceneMessage(ServerMessage):
         layers: Name, top_mm and bottom_mm (None: no end), shear_modulus_kpa of each.
         guide: Its position, None without one.
         axis: Axis of the needle: point (y, z at x = 0) and slope (y, z).
+        zones: Positions of each zone by key of the scenario, all of which move with it; none of a zone in a file.
     """
 
     type: Literal["scene"] = "scene"
@@ -128,6 +130,43 @@ class SceneMessage(ServerMessage):
     needle_radius_mm: float
     axis: dict[str, tuple[float, float]]
     target: Vector
+    zones: list[dict[str, Vector]] = []
+
+
+class ZoneSurface(ProtocolMessage):
+    """A closed surface: coordinates x, y, z (mm), point by point, and indices of points, triangle by triangle."""
+
+    points: list[float]
+    triangles: list[int]
+
+
+class PageZone(ProtocolMessage):
+    """A zone to avoid, its surface and the one of its margin, for the needle's axis. places: as in `SceneMessage`."""
+
+    name: str
+    margin_mm: float
+    places: dict[str, Vector]
+    surface: ZoneSurface
+    margin: ZoneSurface
+
+
+class ZonesMessage(ServerMessage):
+    """The zones of the scene, or of an insertion, in the order of the scenario. It follows the `InsertionMessage`."""
+
+    by = "of"
+
+    type: Literal["zones"] = "zones"
+    of: Literal["scene", "live", "first", "second"]
+    zones: list[PageZone]
+
+
+class NearestZone(ProtocolMessage):
+    """Least clearance of a needle from the zones: the zone's name, and the points of axis and zone that are nearest."""
+
+    zone: str
+    clearance_mm: float
+    needle: Vector
+    surface: Vector
 
 
 class JobMessage(ServerMessage):
@@ -178,7 +217,7 @@ class PlanMessage(ServerMessage):
     """A complete plan. Its needles are a frame SWEEP, the tip's path a frame PATH.
 
     roll_deg: of the bevel's direction at the start, about x from y to z; terms: weighted terms of the cost by name;
-    load: rows of `Invasiveness`; target_name: "" without other targets.
+    load: rows of `Invasiveness`; nearest: over all steps, None without zones; target_name: "" without other targets.
     """
 
     by = "strategy"
@@ -194,6 +233,7 @@ class PlanMessage(ServerMessage):
     cost: float
     terms: dict[str, float]
     seconds: float
+    nearest: NearestZone | None = None
     target_name: str = ""
 
 
@@ -214,7 +254,7 @@ class ReachMessage(ServerMessage):
 class RowsMessage(ServerMessage):
     """Rows of an insertion's periods from `first` on, in order. of: "live", "first" or "second" recording.
 
-    A row has the keys of `record.fields.page_values`.
+    A row has the keys of `record.fields.page_values`; with zones also `nearest`, the estimated needle's `NearestZone`.
     """
 
     by = "of"
@@ -398,4 +438,11 @@ def describe_scene(scenario: Scenario, revision: int) -> SceneMessage:
             "slope": (slope.real, slope.imag),
         },
         target=scenario.target.position,
+        zones=[places_of(zone, number) for number, zone in enumerate(scenario.zone)],
     )
+
+
+def places_of(zone: Zone, number: int) -> dict[str, Vector]:
+    """Return the positions of a zone by key of the scenario, all of which move with it; none of a zone in a file."""
+    names = ("center_mm", "from_mm", "to_mm", "point_mm")
+    return {f"zone.{number}.{name}": getattr(zone, name) for name in names if hasattr(zone, name)}

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from flexneedle.errors import RigError
@@ -10,7 +11,12 @@ from flexneedle.lab.link.records import LinkArm
 from flexneedle.lab.rig.rig_file import RosSettings
 from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import TopicProfile, load_profile
+from flexneedle.lab.ros.zones import make_clearance, make_zones
+from flexneedle.loop.events import Planned
+from flexneedle.planning.events import Event
+from flexneedle.results import Period
 from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.simulator.zones import NO_ZONES, zones_of
 from flexneedle.types import Point
 
 
@@ -40,11 +46,24 @@ class Bridge(LinkBridge):
     def __init__(self, settings: RosSettings, show: Callable[[str], None] = lambda _line: None) -> None:
         profile = load_checked_profile(settings)
         self.settings, self._read, self._armed = settings, profile.subscribe, threading.Event()
+        self._zones = NO_ZONES
         super().__init__(lambda epoch: open_node(profile, epoch=epoch), {"profile": settings.profile}, show)
 
     @property
     def _stops_if_lost(self) -> bool:
         return self.settings.arm  # the operator at ROS could not stop the rig
+
+    def __call__(self, event: Event) -> None:
+        """Publish an event, and the zones of a plan, as a `LinkBridge`."""
+        if isinstance(event, Planned) and (scenario := event.plan.scenario) is not None and scenario.zone:
+            self._zones = zones_of(scenario)
+            self._node.publish(make_zones(scenario))
+        super().__call__(event)
+
+    def _publish_period(self, period: Period) -> None:
+        super()._publish_period(period)
+        if (near := make_clearance(self._zones, period)) is not None:
+            self._node.publish(replace(near, time=near.time + (self._shift or 0.0)))
 
     def await_target(self) -> Point:
         """Wait for a target x, y, z (mm) on its topic. Raises StoppedError after a stop, RunError without the node."""

@@ -10,9 +10,15 @@ import rosbags.typesys.stores.ros2_humble as ros
 
 from flexneedle.lab.link.records import LinkState, LinkTarget
 from flexneedle.lab.ros.frames import FrameMap
-from flexneedle.lab.ros.markers import MarkerScene, make_markers, make_scene
+from flexneedle.lab.ros.markers import (
+    MarkerScene,
+    make_clearance_markers,
+    make_markers,
+    make_scene,
+    make_zone_markers,
+)
 from flexneedle.lab.ros.profile import PlacedTopic, ShapeTopic, TopicProfile
-from flexneedle.lab.ros.records import JointTargets
+from flexneedle.lab.ros.records import JointTargets, RosClearance, RosZones
 from flexneedle.record.fields import FIELDS
 from flexneedle.record.messages import (
     Check,
@@ -193,6 +199,15 @@ def _make_target_markers(composer: MessageComposer, target: LinkTarget) -> Any:
     return make_markers(header, composer.frames["markers"], composer.scene)
 
 
+def _make_zones(composer: MessageComposer, record: RosZones) -> Any:
+    return make_zone_markers(composer.make_header("zones", 0.0), composer.frames["zones"], record)
+
+
+def _make_clearance(composer: MessageComposer, record: RosClearance) -> Any:
+    header = composer.make_header("clearance", record.time)
+    return make_clearance_markers(header, composer.frames["clearance"], record)
+
+
 def _make_skin_entry(composer: MessageComposer, _plan: Plan) -> PointMessage:
     return composer.frames["skin_entry"].map_point(PointMessage(0.0, 0.0, 0.0))
 
@@ -270,6 +285,8 @@ _BUILDERS: dict[type, dict[str, Callable[[MessageComposer, Any], Any]]] = {
         "diagnostics": _make_period_diagnostics,
     },
     LinkTarget: {"markers": _make_target_markers},
+    RosZones: {"zones": _make_zones},
+    RosClearance: {"clearance": _make_clearance},
     LinkState: {"state": _make_state, "diagnostics": _make_rig_diagnostics},
     JointTargets: {"joint_targets": _make_targets},
 }

@@ -1,6 +1,6 @@
 """Markers of a scene: layers of tissue as boxes, the target as a ball with the radius of the paper's target circle."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 
 from flexneedle.lab.ros.frames import FrameMap
+from flexneedle.lab.ros.records import RosClearance, RosZones, ZoneSurface
 from flexneedle.record.messages import Header, PointMessage, PoseMessage, Time, Vector3
 from flexneedle.results import Plan
 from flexneedle.types import Point
@@ -23,6 +24,10 @@ _HALF_WIDTH_MM = 30.0
 _LAYERS = ((0.96, 0.80, 0.69), (0.90, 0.62, 0.55), (0.84, 0.72, 0.55), (0.75, 0.55, 0.60))
 _ALPHA = 0.25
 _NOTHING = Time(0, 0)
+_ZONE, _ZONE_ALPHA, _MARGIN_ALPHA = (0.42, 0.30, 0.58), 0.8, 0.2
+_BLACK = (0.1, 0.1, 0.1, 1.0)
+_LINE_MM, _TEXT_MM = 0.3, 3.0  # width of a line, height of letters
+_ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,42 @@ def _make_ball(header: Header, frame: FrameMap, target: Point | None) -> Iterato
         ball = _make_marker(header, frame, target, (2 * TARGET_RADIUS_MM,) * 3, (0.8, 0.1, 0.1, 0.9))
         ball.ns, ball.type, ball.text = "target", Marker.SPHERE, "target"
         yield ball
+
+
+def make_zone_markers(header: Header, frame: FrameMap, zones: RosZones) -> MarkerArray:
+    """Return the markers of zones and of their margins, as triangles."""
+    return MarkerArray(
+        [_make_surface(header, frame, number, one) for number, one in enumerate(zones.surfaces)]
+    )
+
+
+def _make_surface(header: Header, frame: FrameMap, number: int, surface: ZoneSurface) -> Any:
+    alpha = _MARGIN_ALPHA if surface.is_margin else _ZONE_ALPHA
+    marker = _make_marker(header, frame, _ORIGIN, _ORIGIN, (*_ZONE, alpha))
+    marker.scale = Vector3(1.0, 1.0, 1.0)  # of the points, which have the unit of the frame
+    marker.ns, marker.id, marker.type = (
+        "margins" if surface.is_margin else "zones",
+        number,
+        Marker.TRIANGLE_LIST,
+    )
+    marker.text, marker.points = surface.name, _make_points(frame, surface.corners.tolist())
+    return marker
+
+
+def make_clearance_markers(header: Header, frame: FrameMap, near: RosClearance) -> MarkerArray:
+    """Return a line from the needle to the nearest zone, and the clearance as text."""
+    line = _make_marker(header, frame, _ORIGIN, (_LINE_MM, 0.0, 0.0), _BLACK)
+    line.ns, line.type = "clearance", Marker.LINE_LIST
+    line.points = _make_points(frame, [near.needle, near.surface])
+    text = _make_marker(header, frame, near.needle, (0.0, 0.0, _TEXT_MM), _BLACK)
+    text.ns, text.id, text.type = "clearance", 1, Marker.TEXT_VIEW_FACING
+    text.text = f"{near.clearance:.2f} mm to {near.zone}"
+    return MarkerArray([line, text])
+
+
+def _make_points(frame: FrameMap, points: Iterable[Sequence[float]]) -> list[PointMessage]:
+    """Return points x, y, z (mm), along the axes of the insertion, in the unit of the frame."""
+    return [PointMessage(*(1e-3 * frame.per_metre * value for value in point)) for point in points]
 
 
 def _make_marker(

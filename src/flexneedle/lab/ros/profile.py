@@ -107,6 +107,10 @@ class PublishedTopics(Section):
     """Planned path of the tip."""
     markers: PlacedTopic | None = None
     """Layers of tissue, and the target."""
+    zones: PlacedTopic | None = None
+    """Zones to avoid, and their margins."""
+    clearance: PlacedTopic | None = None
+    """Line from the estimated needle to the nearest zone, and the clearance as text."""
     skin_entry: PlacedTopic | None = None
     """Point where the insertion axis enters the skin."""
     needle_pose: PlacedTopic | None = None
@@ -147,6 +151,8 @@ PUBLISHED: dict[str, str] = {
     "measured_tip": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "plan": "nav_msgs/msg/Path",
     "markers": "visualization_msgs/msg/MarkerArray",
+    "zones": "visualization_msgs/msg/MarkerArray",
+    "clearance": "visualization_msgs/msg/MarkerArray",
     "skin_entry": "geometry_msgs/msg/Point",
     "needle_pose": "geometry_msgs/msg/PoseStamped",
     "guide_pose": "geometry_msgs/msg/PointStamped",
@@ -157,7 +163,7 @@ PUBLISHED: dict[str, str] = {
 }
 """Message type of each key of `publish`."""
 
-LATCHED = ("plan", "markers", "skin_entry", "state")
+LATCHED = ("plan", "markers", "zones", "skin_entry", "state")
 """Keys of `publish` whose last message is also delivered to later subscribers."""
 
 SUBSCRIBED: dict[str, str] = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from flexneedle.lab.link.records import NodeHeartbeat, Requested
 from flexneedle.lab.ros.profile import TopicProfile
-from flexneedle.types import VISIBLE, Point, Quaternion
+from flexneedle.types import VISIBLE, Floats, Point, Quaternion
 
 # Published
 
@@ -20,6 +20,33 @@ class JointTargets:
 
     time: float
     positions: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ZoneSurface:
+    """A zone to avoid, or its margin. corners (3 t, 3): of its t triangles."""
+
+    name: str
+    is_margin: bool
+    corners: Floats
+
+
+@dataclass(frozen=True)
+class RosZones:
+    """The zones of a plan, and their margins."""
+
+    surfaces: tuple[ZoneSurface, ...]
+
+
+@dataclass(frozen=True)
+class RosClearance:
+    """Least clearance of the estimated needle from zones, the name of the zone, and the nearest points of the two."""
+
+    time: float
+    zone: str
+    clearance: float
+    needle: Point
+    surface: Point
 
 
 # Received

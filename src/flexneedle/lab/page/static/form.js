@@ -7,7 +7,7 @@ import { followOptions } from "./form/options.js";
 import { followTargets } from "./form/targets.js";
 import { STEERING, allow } from "./shown.js";
 
-const ORDER = ["target", "needle", "needle.bevel", "tissue", "setup", "entry", "plan", "control", "tracker", "phantom"];
+const ORDER = ["target", "needle", "needle.bevel", "tissue", "zones", "zone", "setup", "entry", "plan", "control", "tracker", "phantom"];
 const LAW = /^(tissue\.\d+)\.law$/;
 const OPEN = ["target", "needle.bevel"];
 
@@ -89,7 +89,7 @@ class Form {
 
   // Make the form again for another scenario, and for other layers or tables.
   #remake({ name, values }) {
-    const words = Object.keys(values).filter((key) => /^tissue\.\d+\.(law|name)$/.test(key)).map((key) => values[key]);
+    const words = Object.keys(values).filter((key) => /^(tissue|zone)\.\d+\.(law|name|shape)$/.test(key)).map((key) => values[key]);
     const made = JSON.stringify([name, Object.keys(values), words]);
     if (made === this.#made) return false;
     const open = this.#sections.filter(({ element }) => element.open).map((section) => section.name);
@@ -127,6 +127,8 @@ class Form {
     if (section.description) section.element.append(make("p.quiet", {}, section.description));
     section.element.append(...section.views.map((view) => view.element));
     if (section.name.startsWith("tissue.")) section.element.append(this.#layerTools(section.name));
+    if (section.name === "zones") section.element.append(this.#newZoneTools());
+    if (section.name.startsWith("zone.")) section.element.append(this.#zoneTools(section.name));
     this.#fill(section);
   }
 
@@ -152,7 +154,7 @@ class Form {
     const [, name] = LAW.exec(field.key) ?? [];
     const { values } = this.#session;
     if (!name) return editOf(field, value, values);
-    const [layers, layer] = [layersOf(values), Number(name.split(".")[1])];
+    const [layers, layer] = [tablesOf(values, "tissue"), Number(name.split(".")[1])];
     return { tissue: layers.with(layer, withLaw(this.#schema, layers[layer], value)) };
   }
 
@@ -185,12 +187,26 @@ class Form {
     first.views.find(({ element }) => element.matches(".refused"))?.element.scrollIntoView({ block: "center" });
   }
 
+  // Edit all tables of an array of the scenario.
+  #change(array, make) {
+    this.#link.edit({ [array]: make(tablesOf(this.#session.values, array)) });
+    this.#link.rest();
+  }
+
+  #newZoneTools() {
+    const add = (shape) => this.#change("zone", (zones) => [...zones, { shape, name: `${shape} ${zones.length + 1}`, ...newZone(shape, this.#store.get("scene").target) }]);
+    const choices = ["sphere", "capsule", "box", "half-space"].map((shape) => button(`Add a ${shape}`, () => add(shape)));
+    return make("div.tools", {}, ...choices);
+  }
+
+  #zoneTools(name) {
+    const zone = Number(name.split(".")[1]);
+    return make("div.tools", {}, button("Remove", () => this.#change("zone", (zones) => zones.toSpliced(zone, 1)), { "aria-label": `Remove zone ${zone + 1}` }));
+  }
+
   #layerTools(name) {
     const layer = Number(name.split(".")[1]);
-    const change = (make) => {
-      this.#link.edit({ tissue: make(layersOf(this.#session.values)) });
-      this.#link.rest();
-    };
+    const change = (make) => this.#change("tissue", make);
     const add = () => change((layers) => layers.toSpliced(layer, 0, { ...layers[layer], thickness_mm: layers[layer].thickness_mm ?? 10 }));
     const remove = button("Remove", () => change((layers) => layers.toSpliced(layer, 1)), { "aria-label": `Remove layer ${layer + 1}` });
     remove.disabled = !("tissue.1.shear_modulus_kpa" in this.#session.values);
@@ -208,17 +224,28 @@ function editedOf(field, draft) {
 // Return whether a key belongs to a field or its table.
 const isOf = (field, key) => key === field.key || (field.start && key.startsWith(`${field.key}.`));
 
-// Tables of the layers, from values by key.
-function layersOf(values) {
-  const layers = [];
+// Tables of an array of the scenario, such as "tissue", from values by key.
+function tablesOf(values, array) {
+  const tables = [];
   for (const [key, value] of Object.entries(values)) {
-    const [, layer, part] = /^tissue\.(\d+)\.(.+)$/.exec(key) ?? [];
-    if (layer) (layers[layer] ??= {})[part] = value;
+    const [name, table, ...part] = key.split(".");
+    if (name === array && part.length) (tables[table] ??= {})[part.join(".")] = value;
   }
-  return layers;
+  return tables;
+}
+
+// Values of a new zone: beside the way to the target, or beyond it.
+function newZone(shape, [depth, y, z]) {
+  const [beside, beyond] = [[0.5 * depth, y + 8, z], [depth + 10, 0, 0]];
+  return {
+    sphere: { center_mm: beside, radius_mm: 3 },
+    capsule: { from_mm: [beside[0], beside[1], z - 10], to_mm: [beside[0], beside[1], z + 10], radius_mm: 2 },
+    box: { center_mm: beside, size_mm: [4, 4, 4] },
+    "half-space": { point_mm: beyond, normal: [-1, 0, 0] },
+  }[shape];
 }
 
 function place(name) {
-  const at = ORDER.indexOf(name.startsWith("tissue") ? "tissue" : name);
+  const at = ORDER.indexOf(/^(tissue|zone)\./.test(name) ? name.split(".")[0] : name);
   return at < 0 ? ORDER.length : at;
 }

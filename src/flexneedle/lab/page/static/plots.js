@@ -1,4 +1,4 @@
-// Plots over time: error, guide, roll, indicator, tissue energy, predicted miss; the line is the player's period.
+// Plots over time: error, miss, clearance, guide, roll, indicator, tissue energy, predicted miss; the line is the player's period.
 // The error is the true tip's on a virtual rig, the estimated tip's on a rig.
 
 import { make } from "./dom.js";
@@ -18,6 +18,10 @@ const PLOTS = [
     { name: "miss", tone: "--estimate", of: (row) => distance(row.miss_mm) },
     { name: "+ 2 standard deviations", tone: "--predicted", of: bound(1), thin: true },
     { name: "− 2 standard deviations", tone: "--predicted", of: bound(-1), thin: true },
+  ] },
+  { title: "Clearance from zones (mm)", none: "There are no zones to avoid.", lines: [
+    { name: "estimated", tone: "--estimate", of: (row) => row.clearance_mm },
+    { name: "true", tone: "--true", of: (row) => row.true_clearance_mm, dash: true },
   ] },
   { title: "Guide (mm)", lines: [
     { name: "y", tone: "--guide", of: (row) => row.guide[0] },

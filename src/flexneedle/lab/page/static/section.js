@@ -1,4 +1,4 @@
-// The scene in section: x–y, x–z, or the plane through axis and target. Target, guide and boundaries are moved here.
+// The scene in section: x–y, x–z, or the plane through axis and target. Target, guide, boundaries, zones and entry are moved here.
 
 import { boxOf } from "./box.js";
 import { button, make, shown } from "./dom.js";
@@ -11,6 +11,7 @@ import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
 import { SHOWN, STEERING, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
 import { stillNote } from "./still.js";
+import { entryEdit, entryOf, shownNearest, shownZones, zoneEdit, zoneEntries } from "./zones.js";
 
 const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Target", "target"]];
 const STRETCHES = [1, 2, 5];
@@ -86,9 +87,10 @@ class SectionView {
     const map = mappingOf(this.#box, width, height, this.#stretch);
     const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
     const parts = partsOf(this.#store, scene);
-    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, others, parts, outline, store: this.#store });
-    showLegend(this.#legend, entriesOf([...parts, ...measuredTip(this.#store)], reached), others);
-    this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, target, height }) : []);
+    const [zones, near] = [shownZones(this.#store), shownNearest(this.#store)];
+    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, others, parts, outline, zones, near, store: this.#store });
+    showLegend(this.#legend, [...entriesOf([...parts, ...measuredTip(this.#store)], reached), ...zoneEntries(zones, near)], others);
+    this.#handles.update(mayMove(this.#store) ? [...this.#handlesOf({ map, plane, layers, guide, target, height }), ...this.#zoneHandles({ map, plane, zones })] : []);
   }
 
   #handlesOf({ map, plane, layers, guide, target, height }) {
@@ -119,6 +121,25 @@ class SectionView {
       });
     });
     return handles;
+  }
+
+  // Handles of zones that can be moved, and of the entry. What moves stays as far from the plane.
+  #zoneHandles({ map, plane, zones }) {
+    const point = (id, form, name, placeNow, editTo) => {
+      const move = (x, u) => this.#link.edit(editTo(lifted(plane, x, u, placeNow())));
+      const [x, ...out] = placeNow();
+      return {
+        id, form: `point.${form}`, name: `${name}: depth ${shown(x)} mm, lateral ${out.map((each) => shown(each)).join(" and ")} mm. ${KEYS}`,
+        at: [map.toX(x), map.toY(lateral(plane, x, ...out))],
+        drag: (px, py) => move(map.fromX(px), map.fromY(py)),
+        nudge: (right, up) => move(placeNow()[0] + right, lateral(plane, ...placeNow()) + up),
+      };
+    };
+    const movable = zones.filter(({ center }) => center);
+    return [
+      ...movable.map(({ name, number }) => point(`zone-${number}`, "zone", `Zone ${name}`, () => shownZones(this.#store)[number].center, (to) => zoneEdit(this.#store, number, to))),
+      point("entry", "entry", "Entry", () => entryOf(this.#store), (to) => entryEdit(this.#store, to)),
+    ];
   }
 }
 

@@ -30,7 +30,7 @@ export function retracts(store) {
 
 // Keys to subscribe to for the functions of this module.
 export const SHOWN = [
-  "view of", "view period", "view theme", "scene", "session", "draft", "insertion ", "rows ", "shape ", "plan ",
+  "view of", "view period", "view theme", "scene", "session", "draft", "insertion ", "rows ", "zones ", "shape ", "plan ",
   "iteration ", "job compare", "reach", "estimate",
 ];
 

@@ -4,6 +4,7 @@
 import { button, make, shown } from "./dom.js";
 import { SHOWN, shownRow, shownTarget } from "./shown.js";
 import { stillNote } from "./still.js";
+import { clearanceIn, shownNearest } from "./zones.js";
 
 const KEYS = "Arrow keys turn, with Shift they shift the view; + and − zoom; 0 resets; 1, 2 and 3 show x–y, x–z and along the axis.";
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
@@ -60,6 +61,8 @@ function inWords(store) {
   const [target, row] = [shownTarget(store), shownRow(store)];
   const parts = [];
   if (target) parts.push(`Target at ${point(target)} mm.`);
+  const near = shownNearest(store);
+  if (near) parts.push(`Least clearance ${clearanceIn(near)} to ${near.zone}.`);
   if (row) parts.push(`Estimated tip at ${point(row.estimate)} mm. Error from the planned path ${shown(row.error_mm)} mm.`);
   return parts.join(" ");
 }

@@ -11,13 +11,13 @@ import { runs } from "./shown.js";
 
 const KINDS = Object.keys(Kind).map((name) => name.toLowerCase());
 const SOURCES = Object.keys(Source).map((name) => name.toLowerCase());
-const BY = { job: "kind", iteration: "strategy", plan: "strategy", rows: "of", insertion: "of" };
+const BY = { job: "kind", iteration: "strategy", plan: "strategy", rows: "of", insertion: "of", zones: "of" };
 const BEFORE_ROWS = ["waiting", "planning"];
 const STAY = ["samples", "channel"];
 const RECORDED = ["first", "second"];
 const INSERTIONS = ["live", ...RECORDED];
 const OWN = /^(view |connection|refusals$|draft$)/;
-const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (needle|path|samples|reach|sweep) scene)$/;
+const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|zones scene|shape (needle|path|samples|reach|sweep) scene)$/;
 
 // Key of a message of the server.
 export function keyOf(message) {
@@ -135,7 +135,7 @@ export class Store {
 
   #forget(of) {
     if (of !== "second") for (const key of ["view of", "view period"]) this.set(key, undefined);
-    this.set(`rows ${of}`, undefined);
+    for (const what of ["rows", "zones"]) this.set(`${what} ${of}`, undefined);
     for (const kind of KINDS) {
       this.#tracks.delete(`${kind} ${of}`);
       this.set(`shape ${kind} ${of}`, undefined);

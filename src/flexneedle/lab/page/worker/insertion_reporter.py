@@ -10,11 +10,12 @@ from flexneedle.lab.page.shape_frames import FrameSource
 from flexneedle.lab.page.worker.plan_jobs import samples_of, shapes_of
 from flexneedle.lab.page.worker.recordings import channel_of, frames_of
 from flexneedle.lab.page.worker.task import WorkerTask
+from flexneedle.lab.page.worker.zones import describe_row, describe_zones
 from flexneedle.lab.rig.notices import STILL_IN
 from flexneedle.loop.events import Decided, PeriodEnded, Planned
 from flexneedle.planning.events import Event, Iterated
-from flexneedle.record.fields import page_values
 from flexneedle.results import Insertion, Outcome, Period, Plan
+from flexneedle.simulator.zones import NO_ZONES, ZoneMap, zones_of
 
 _ENDED = (Outcome.DONE, Outcome.HELD, Outcome.FAILED, Outcome.INTERRUPTED)
 """Outcomes after which the needle remains in the tissue on a rig."""
@@ -28,6 +29,7 @@ class InsertionReporter:
         task: The job.
         rig: Name of the rig, "" for a virtual one.
         folder: Name of the run that records it, "" without one.
+        zones: Zones to avoid, after the plan.
         notes: Lines for the summary at the end.
     """
 
@@ -36,6 +38,7 @@ class InsertionReporter:
     periods: int = 0
     rig: str = ""
     folder: str = ""
+    zones: ZoneMap = NO_ZONES
     notes: list[str] = field(default_factory=list)
 
     def announce(self, state: str, summary: str = "", ended: Insertion | None = None) -> None:
@@ -85,7 +88,8 @@ class InsertionReporter:
 
     def report_plan(self, plan: Plan) -> None:
         """Report the plan."""
-        self.plan = plan
+        self.plan, self.zones = plan, zones_of(self.task.scenario)
+        self.task.report(describe_zones(self.task.scenario, "live"))
         self.task.report(shapes_of(plan, FrameSource.LIVE)[0])
         self.task.report_job("running", 0.0, "planned")
 
@@ -95,7 +99,8 @@ class InsertionReporter:
         self.periods = period.index + 1
         for frame in frames_of([period], FrameSource.LIVE):
             self.task.report(frame)
-        self.task.report(RowsMessage(of="live", first=period.index, rows=[page_values(period, self.plan)]))
+        row = describe_row(period, self.plan, self.zones)
+        self.task.report(RowsMessage(of="live", first=period.index, rows=[row]))
         depth = max(self.plan.tips[-1, 0] - self.plan.tips[0, 0], 1e-9)
         share = (period.estimate.x - self.plan.tips[0, 0]) / depth
         self.task.report_job("running", min(max(share, 0.0), 1.0), f"tip at {period.estimate.x:.1f} mm")

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.lab.page.protocol import EstimateMessage, IterationMessage, PlanMessage
+from flexneedle.lab.page.protocol import EstimateMessage, IterationMessage, NearestZone, PlanMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, make_frame
 from flexneedle.lab.page.worker.task import WorkerTask
+from flexneedle.lab.page.worker.zones import describe_zones, find_nearest
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.planning import STRATEGIES
 from flexneedle.planning.events import Event, Iterated
@@ -20,6 +21,7 @@ from flexneedle.results import Plan
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.zones import NO_ZONES, zones_of
 
 _ESTIMATE = (24, 4)
 """Samples and iterations of an estimate."""
@@ -50,7 +52,8 @@ def warm_up() -> None:
 
 
 def needle(task: WorkerTask) -> None:
-    """Report the needle of a scenario at the start, bent by its guide."""
+    """Report the zones of a scenario, and the needle at the start, bent by its guide."""
+    task.report(describe_zones(task.scenario, "scene"))
     nodes = Simulator(task.scenario, threads=1).start().nodes[:, :3]
     task.report(make_frame(FrameKind.NEEDLE, FrameSource.SCENE, 0, nodes))
 
@@ -150,8 +153,14 @@ def describe_plan(plan: Plan, revision: int, target_name: str) -> PlanMessage:
         cost=plan.cost,
         terms=plan.terms,
         seconds=plan.seconds,
+        nearest=_find_nearest(plan),
         target_name=target_name,
     )
+
+
+def _find_nearest(plan: Plan) -> NearestZone | None:
+    zones = NO_ZONES if plan.scenario is None else zones_of(plan.scenario)
+    return find_nearest(zones, plan.shapes, plan.least_clearance_mm)
 
 
 def shapes_of(plan: Plan, source: FrameSource) -> tuple[ShapeFrame, ShapeFrame]:

@@ -17,11 +17,12 @@ from flexneedle.lab.page.protocol import (
 )
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, make_frame
 from flexneedle.lab.page.worker.task import WorkerTask
-from flexneedle.record.fields import page_values
+from flexneedle.lab.page.worker.zones import describe_row, describe_zones
 from flexneedle.record.loading import load_insertion
 from flexneedle.record.saving import save
 from flexneedle.results import Insertion, Period, scenario_of
 from flexneedle.simulator.state import Contacts
+from flexneedle.simulator.zones import zones_of
 from flexneedle.types import Floats, Shape
 
 
@@ -61,10 +62,14 @@ def describe_recording(
         row=row,
         scene=describe_scene(scenario_of(insertion), 0),
     )
+    yield describe_zones(scenario_of(insertion), of)
     yield make_frame(FrameKind.PATH, source, 0, plan.tips[:, :3])
     if insertion.periods:
         yield from frames_of(insertion.periods, source)
-    yield RowsMessage(of=of, first=0, rows=[page_values(period, plan) for period in insertion.periods])
+    zones = zones_of(scenario_of(insertion))
+    yield RowsMessage(
+        of=of, first=0, rows=[describe_row(period, plan, zones) for period in insertion.periods]
+    )
 
 
 def save_complete(insertion: Insertion, folder: str) -> None:

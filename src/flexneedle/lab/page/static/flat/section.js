@@ -6,6 +6,7 @@ import { layersIn } from "./layers.js";
 import { FOOT, SIDE, area, cross, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
 import { lateral, stretchIn } from "./plane.js";
 import { reachIn } from "./reach.js";
+import { drawNearest, drawZones } from "./zones.js";
 
 const GUIDE = [6, 3.2]; // mm, length and width
 const NAMES = { top: 24, step: 13, rows: 4, gap: 4 }; // px, of the names of layers; thin ones are below each other
@@ -18,7 +19,7 @@ export function outlineOf(plane, store) {
 }
 
 // outline: of the reach. Returns whether it was drawn.
-export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, others = [], parts, outline, store }) {
+export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, others = [], parts, outline, zones = [], near = null, store }) {
   const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
   const row = shownRow(store);
   let reached = false;
@@ -27,7 +28,9 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
   inside(pen, width, height, () => {
     drawNames(pen, map, layers, width);
     reached = reach(pen, map, outline);
+    drawZones(pen, map, plane, zones);
     for (const part of parts) draw(pen, part, place, map);
+    if (near) drawNearest(pen, near, place);
     if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);
     if (isMeasured(row)) cross(pen, place(...row.measured), { tone: "--measured" });
     for (const { name, position } of others) drawOther(pen, map, plane, name, position);

@@ -13,7 +13,7 @@ const LAW = "Law of radial compression. A custom law is set in a scenario file."
 const TERMS = "terms"; // custom cost terms are set in a scenario file
 const OWN_TYPES = { number: "number", string: "string", boolean: "boolean" }; // by type of the value
 
-// Sections with their fields: [{name, title, description, fields}]; a layer of the tissue and a table is a section.
+// Sections with their fields: [{name, title, description, fields}]; a layer of the tissue, a zone and a table is a section.
 export function sectionsOf(schema, values) {
   const sections = [];
   addSection(sections, schema, "", { ...schema, title: "General", description: "" }, values);
@@ -26,6 +26,7 @@ function addSection(sections, schema, name, table, values) {
   for (const [part, property] of Object.entries(table.properties ?? {})) {
     const key = name ? `${name}.${part}` : part;
     if (key === "tissue") addLayers(sections, schema, property, values);
+    else if (key === "zone") addZones(sections, schema, values);
     else if (part !== TERMS) addValue(sections, section, schema, key, property, values);
   }
 }
@@ -56,6 +57,16 @@ function addLayers(sections, schema, property, values) {
     const choices = law in laws ? Object.keys(laws) : [law];
     const properties = { ...table.properties, law: { enum: choices, description: LAW } };
     addSection(sections, schema, name, { ...table, properties }, values);
+  }
+}
+
+// A zone has the fields of its shape, which stays.
+function addZones(sections, schema, values) {
+  const tables = schema.properties.zone.items.anyOf.map((each) => resolved(schema, each));
+  for (let zone = 0; `zone.${zone}.shape` in values; zone++) {
+    const table = tables.find(({ properties }) => properties.shape.const === values[`zone.${zone}.shape`]);
+    const { shape: _, ...properties } = table.properties;
+    addSection(sections, schema, `zone.${zone}`, { properties, description: "" }, values);
   }
 }
 
@@ -181,6 +192,8 @@ function namesOf(key) {
 function titleOf(name, values) {
   const [, layer] = /^tissue\.(\d+)$/.exec(name) ?? [];
   if (layer) return `Layer ${Number(layer) + 1}: ${values[`${name}.name`] ?? "tissue"}`;
+  const [, zone] = /^zone\.(\d+)$/.exec(name) ?? [];
+  if (zone) return `Zone ${Number(zone) + 1}: ${values[`${name}.name`]}, ${values[`${name}.shape`]}`;
   const words = name.replaceAll("_", "-").split(".").join(", ");
   return words ? words[0].toUpperCase() + words.slice(1) : "General";
 }

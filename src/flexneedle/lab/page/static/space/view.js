@@ -9,6 +9,7 @@ import { Labels } from "./labels.js";
 import { Room } from "./room.js";
 import { Shapes } from "./shapes.js";
 import { Target } from "./target.js";
+import { Zones } from "./zones.js";
 
 const SHARPEST = 2; // device pixels to a pixel of the page
 
@@ -30,9 +31,11 @@ export class SpaceView {
     this.labels = new Labels();
     this.room = new Room(this.labels);
     this.shapes = new Shapes();
+    this.zones = new Zones();
+    this.renderer.localClippingEnabled = true; // of zones, at the room
     this.target = new Target(this.camera, canvas, store, link, () => this.#schedule());
     this.scene = new Scene();
-    this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.target.group, ...lights(this.camera.camera));
+    this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.zones.group, this.target.group, ...lights(this.camera.camera));
     new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
     new IntersectionObserver((entries) => this.#appear(entries.at(-1).isIntersecting)).observe(canvas);
     store.subscribe([...SHOWN, ...STEERING], () => this.#update());
@@ -48,7 +51,8 @@ export class SpaceView {
     const scene = shownScene(this.#store);
     if (!scene) return;
     this.#updateRoom(scene);
-    showLegend(this.#legend, this.shapes.update(this.#store, scene, shownOf(this.#store)), otherTargets(this.#store));
+    const entries = [...this.shapes.update(this.#store, scene, shownOf(this.#store)), ...this.zones.update(this.#store)];
+    showLegend(this.#legend, entries, otherTargets(this.#store));
     this.target.update();
     this.#later ||= requestAnimationFrame(() => {
       this.#later = 0;
@@ -63,6 +67,7 @@ export class SpaceView {
     const another = JSON.stringify(box) !== JSON.stringify(JSON.parse(this.#room || "[null]")[0]);
     this.#room = room;
     this.room.update(scene, box);
+    this.zones.clip(box);
     this.#fitLabels();
     if (another && !this.target.dragged) this.camera.follow(box);
   }
