@@ -304,7 +304,7 @@ def _of(plan: Plan, scenario: Scenario) -> Plan:
 
 
 def _worst_shift(scenario: Scenario, plan: Plan, size: float, space: bool) -> Any:
-    """Return the displacement (3,) of this size, of some directions across the needle, after which a plan is nearest."""
+    """Return the displacement (3,) of this size, of some across the needle, after which a plan is nearest."""
     angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False) if space else np.array([0.0, np.pi])
     shifts = size * np.stack([np.zeros_like(angles), np.cos(angles), np.sin(angles) * space], axis=1)
     least = [zones_of(displace(scenario, each)).clearances(plan.shapes[..., :3]).min() for each in shifts]

@@ -191,7 +191,7 @@ def intrusion(trajectories: Trajectories, clear: float, soft: float = 0.0) -> Fl
 def detour_compression(trajectories: Trajectories) -> Floats:
     """Return the largest compression of the tissue beyond 0.3, for detours around zones.
 
-    Tissue that the needle pushes aside takes zones in it along; they are taken to be fixed.
+    Tissue that the needle pushes sideways moves zones in it; they are assumed to be fixed.
     """
     excess: Floats = np.maximum(1.0 - trajectories.stretch.min(axis=1) - _COMPRESSION, 0.0)
     return excess

@@ -2,7 +2,7 @@
 
 The cost has the terms of zones in addition (`costs.terms`). A search from one Gaussian would commit itself to one way
 round each zone, often a blocked one; so the best of the different ways are refined by a few iterations each, and the
-search goes on with the best of these. The others follow while no plan is clear.
+search continues with the best of these. The others follow while no plan is clear.
 """
 
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ _LOST_MM = 150.0  # cost after a race that the search is not expected to mend
 _LAPS = 4  # iterations of each in a race
 _ENTRY_SIGMA = 0.05  # of the bounds: ways are closer to their end than a first sample
 _TO_TARGET = 0.95  # correlation of point and slope, so that the path still ends near the target
-_BEVEL_SIGMA = 0.5  # of that of a search without zones: a way has its rolls
+_BEVEL_SIGMA = 0.5  # of the deviation in a search without zones: a way has its rolls
 
 
 def search_detours(
@@ -80,7 +80,7 @@ def refine(
     rng: np.random.Generator,
     progress: OnIteration,
 ) -> Solution:
-    """Return the solution of a problem that differs a little from that of a solution."""
+    """Return the solution of a problem that differs a little, searched from a solution."""
     about = variables_about(problem, solution.search_state.best)
     search = replace(search, iterations=_REFINED, usual=_REFINED)
     return make_solution(problem, find_best(about, rollout, problem.terms, search, rng, progress=progress))

@@ -1,4 +1,4 @@
-"""What would let a plan keep clear of all zones: a larger entry disc, a larger angle, or a smaller margin."""
+"""Settings that would let a plan keep clear of all zones: entry disc, angle or margin."""
 
 import numpy as np
 

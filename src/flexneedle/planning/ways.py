@@ -40,7 +40,7 @@ _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 @dataclass(frozen=True)
 class Room:
-    """What a path is judged by.
+    """Properties of a room by which a path is judged.
 
     clearances: maps points (…, 3) of the needle's axis to their clearances (…), mm; lengths: maps depths (p,), mm, to
     the tissue's compression lengths there (p,), mm; curvature: of the needle at the limit of its strain (1/mm).

@@ -64,7 +64,7 @@ class DistanceGrid(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """Where a needle is nearest to a zone, or deepest in its margin.
+    """Place where a needle is nearest to a zone, or deepest in its margin.
 
     zone: its name; clearance and margin: mm; needle, surface (3,): points of axis and zone.
     """

@@ -164,7 +164,7 @@ def test_a_label_map_of_nifti_is_the_same_case(folder, tmp_path):
 
 @pytest.mark.filterwarnings("ignore:datetime.datetime.utcnow:DeprecationWarning")
 def test_the_files_of_the_abdomen_by_pynrrd(tmp_path):
-    """Positions of voxels are those of the anatomy: the target is in the middle of its lesion."""
+    """Positions of voxels agree with the anatomy: the target is in the middle of its lesion."""
     labels, points, _ = write_example(tmp_path, 3, (1.0, 1.0, 2.0))
     values, header = nrrd.read(str(labels))
     assert header["space"] == "left-posterior-superior"
