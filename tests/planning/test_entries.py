@@ -8,6 +8,7 @@ import pytest
 import flexneedle
 from flexneedle.errors import InputError
 from flexneedle.planning.entries import map_entries
+from flexneedle.planning.second_opinion import exact_clearances
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.zones import zones_of
 from flexneedle.types import X
@@ -52,7 +53,8 @@ def test_numbers_are_those_of_the_insertion_from_the_fixed_entry(found):
         np.testing.assert_allclose(found.error_mm[k], error, atol=1e-6)
         np.testing.assert_allclose(found.peak_energy_uj[k], 1e3 * done.energy.max(), rtol=1e-5)
         clearance = exact.clearance[done.tips[:, :, X] > 0.0].min()
-        np.testing.assert_allclose(found.clearance_mm[k], clearance, atol=1e-5)
+        if k not in found.best(10):
+            np.testing.assert_allclose(found.clearance_mm[k], clearance, atol=1e-5)
         if clearance >= zones.margin:  # the bound is for this distance, or a larger one
             assert zones.clearances(done.shapes[0, ..., :3]).min() + zones.added.max() >= clearance
         assert np.hypot(*found.slopes[k]) <= 0.2 + 1e-9
@@ -72,6 +74,15 @@ def test_clear_entries_keep_the_margin_of_each_zone(found):
             found.zone[k] == (least - zones.margins).argmin()
             or np.ptp(np.sort(least - zones.margins)[:2]) < 0.1
         )
+
+
+def test_the_best_are_judged_by_the_exact_rod(found):
+    zones = zones_of(found.scenario)
+    for k in found.best(10)[::3]:
+        rows = found.controls[k][found.controls[k, :, X] > 0.0]
+        exact = exact_clearances(found.scenario_at(k), zones, rows, found.rolls[k]).min(axis=1)
+        assert (exact >= zones.margins).all()
+        assert found.clearance_mm[k] <= exact.min()
 
 
 def test_displaced_and_turned_insertions_within_the_tolerance_are_clear(found):

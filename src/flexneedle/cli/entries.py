@@ -48,7 +48,7 @@ def map_entries(args: argparse.Namespace) -> int:
         raise InputError("--strategy: not with --entries, whose insertions are steered by the bevel alone")
     scenario = choose_scenario(args)
     check_free(scenario)
-    compile_first(scenario.setup.axes, phantoms=False)
+    compile_first(scenario.setup.axes, phantoms=bool(scenario.zone))
     folder = Folder.claim(args.out, run_name(args), "entries", scenario, args.seed)
     with print_problems(folder), Progress() as progress:
         progress.begin("Mapping entries")

@@ -5,22 +5,19 @@ chosen by superposition (`planning.ways`) and carried out, with the slope correc
 """
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.errors import InputError
 from flexneedle.invasiveness import Invasiveness
-from flexneedle.mechanics.zones import MORE, Zones
 from flexneedle.planning.entry import add_along, read_entry
+from flexneedle.planning.entry_clearance import judge_best, measure_clearance
 from flexneedle.planning.entry_map import PRECISE_MM, EntryMap, Whole
 from flexneedle.planning.planner import make_room
 from flexneedle.planning.primitives import make_controls
 from flexneedle.planning.problem import ROUNDING, PlanProblem, make_problem
-from flexneedle.planning.tolerance import find_angles, find_offsets
 from flexneedle.planning.ways import Responses, rate
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -33,7 +30,6 @@ _TRIED = 3  # patterns of each entry that are carried out
 _ROUNDS = 3  # of corrections
 _RESERVE_MM = 0.1  # of clearance beyond the margin, for which superposed paths are charged
 _MISS = 10.0  # cost of a miss by a slope that is not free, since nothing corrects it
-_FAR_MM = 1e3
 
 
 def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) -> EntryMap:
@@ -55,7 +51,7 @@ def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) 
     found = _carry_out(simulator, problem, zones, *_correct(simulator, problem, z))
     order = found.order
     _, first = np.unique(number[order], return_index=True)
-    return found.take(order[first])
+    return judge_best(found.take(order[first]))
 
 
 def check_free(scenario: Scenario) -> None:
@@ -145,7 +141,7 @@ def _carry_out(
         _parts(slope + entry.slope),
         reached,
         error_mm=error,
-        **_measure_clearance(simulator, zones, done, reached),
+        **measure_clearance(simulator, zones, done, reached),
         length_mm=_lengths(done),
         peak_energy_uj=energies[:, 0],
         mean_energy_uj=energies[:, 1],
@@ -199,74 +195,3 @@ def _lengths(done: Trajectories) -> Floats:
 
 def _parts(lateral: Laterals) -> Floats:
     return np.stack([lateral.real, lateral.imag], axis=1)
-
-
-# ---- clearance
-
-
-def _measure_clearance(
-    simulator: Simulator, zones: ZoneMap, done: Trajectories, reached: Flags
-) -> dict[str, Any]:
-    """Return the fields of `EntryMap` that depend on zones."""
-    axes, paths = simulator.scenario.setup.axes, _paths(simulator.scenario, done)
-    slack = _least_clearances(simulator, _with_margins(zones), done) - zones.margin
-    clear = reached & (slack >= 0.0)
-    apart = _from_margins(zones, paths).min(axis=2)
-    lacking = np.maximum(apart.min(axis=0, initial=_FAR_MM) - slack, 0.0)[clear]
-    sizes = np.zeros((2, len(paths)))
-    for size, find in zip(sizes, (find_offsets, find_angles), strict=True):
-        size[clear] = find(paths[clear], partial(_slack, zones), lacking, axes)
-    return {
-        "clear": clear,
-        "clearance_mm": _least_clearances(simulator, zones.exact, done),
-        "zone": apart.argmin(axis=0) if zones else np.full(len(paths), -1),
-        "offset_mm": sizes[0],
-        "angle_mrad": 1e3 * sizes[1],
-    }
-
-
-def _with_margins(zones: ZoneMap) -> Zones:
-    """Return the zones with distances at any distance, larger by the differences of their margins."""
-    rows = zones.exact.rows.copy()
-    rows[:, MORE] += zones.margins - zones.margin
-    return zones.exact._replace(rows=rows)
-
-
-def _least_clearances(simulator: Simulator, zones: Zones, done: Trajectories) -> Floats:
-    """Return the least clearances (N,), mm, in the tissue; infinite without zones."""
-    again = simulator.with_zones(zones).rollout(
-        simulator.start(), done.controls, outputs="clearance", limits=False
-    )
-    found: Floats = np.where(done.tips[:, :, X] > 0.0, again.clearance, np.inf).min(axis=1)
-    return found
-
-
-def _from_margins(zones: ZoneMap, points: Floats) -> Floats:
-    """Return the distances (z, …), mm, of the needle at points (…, 3) of its axis from the margins."""
-    margins = zones.margins.reshape(-1, *[1] * (points.ndim - 1))
-    found: Floats = zones.clearances(points) - margins
-    return found
-
-
-def _slack(zones: ZoneMap, points: Floats) -> Floats:
-    """Return the distances (…), mm, of the needle at points (…, 3) from the nearest margin."""
-    nearest: Floats = _from_margins(zones, points).min(axis=0, initial=np.inf)
-    return nearest
-
-
-def _paths(scenario: Scenario, done: Trajectories) -> Floats:
-    """Return points (N, p, 3) of each insertion: its entry point, the path of the tip, and the needle at the end."""
-    goal = scenario.target.depth_mm
-    depths = np.linspace(0.0, goal, int(np.ceil(goal / scenario.contact.spacing_mm)) + 1)
-    return np.concatenate([_at(depths, done.tips), _at(depths, done.shapes[:, -1])], axis=1)
-
-
-def _at(depths: Floats, poses: Floats) -> Floats:
-    """Return points (N, p, 3) at depths (p,) of lines of poses (N, k, 5), at their ends beyond these."""
-    found = np.empty((len(poses), len(depths), 3))
-    for points, line in zip(found, poses, strict=True):
-        x = np.maximum.accumulate(line[:, X])
-        points[:, X] = np.minimum(depths, x[-1])
-        for axis in (Y, Z):
-            points[:, axis] = np.interp(depths, x, line[:, axis])
-    return found

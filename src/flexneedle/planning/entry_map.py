@@ -20,6 +20,8 @@ _APART = 0.25  # of the disc's radius: distance of entries that are distinct
 class EntryMap:
     """Entry points of a scenario, E of them, each with the best insertion to the target that was found for it.
 
+    Clearance and tolerance of the best ten are the smaller ones of the simulator's and the exact rod's, as of a plan.
+
     Attributes:
         scenario: The scenario, with a free entry.
         points: y, z of the entry points on the skin (E, 2), mm.
@@ -68,7 +70,7 @@ class EntryMap:
 
         Of entries that are not clear, those with the larger clearance are first. Rooms within 0.1 mm are equal.
         """
-        room = np.where(self.clear, np.round(self.room_mm / _EQUAL_MM), np.minimum(self.clearance_mm, 0.0))
+        room = np.where(self.clear, np.round(self.room_mm / _EQUAL_MM), self.clearance_mm)
         return np.lexsort((self.peak_energy_uj, -room, ~self.clear, ~self.reached))
 
     def best(self, count: int) -> list[int]:
