@@ -55,7 +55,6 @@ def map_entries(args: argparse.Namespace) -> int:
         found = record_entries(folder, scenario)
         progress.finish("Mapping entries")
     _report(found, folder, as_json=args.json)
-    args.write_entries(args, found)
     return 0 if found.clear.any() else 1
 
 

@@ -36,7 +36,7 @@ def add_parser(commands: Commands) -> None:
         commands,
         "plan",
         "plan an insertion and draw the plan",
-        run_plan,
+        _plan,
         "flexneedle plan phantom --target 40 1.5 --strategy both",
         "flexneedle plan mine.toml --seed 3 --json",
         "flexneedle plan mine.toml --entries",
@@ -49,11 +49,9 @@ def add_parser(commands: Commands) -> None:
         help="instead of a plan: a map of the free entry points with clearance, load and tolerance, without motion of "
         "the guide",
     )
-    parser.set_defaults(write_entries=lambda *_: None)
 
 
-def run_plan(args: argparse.Namespace) -> int:
-    """Plan, or map the entries; return the exit status."""
+def _plan(args: argparse.Namespace) -> int:
     if args.entries:
         return map_entries(args)
     from flexneedle.cli.progress import Progress
