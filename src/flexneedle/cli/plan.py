@@ -38,7 +38,6 @@ def add_parser(commands: Commands) -> None:
         "plan an insertion and draw the plan",
         _plan,
         "flexneedle plan phantom --target 40 1.5 --strategy both",
-        "flexneedle plan mine.toml --seed 3 --json",
         "flexneedle plan mine.toml --entries",
     )
     add_run_arguments(parser)
