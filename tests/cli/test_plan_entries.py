@@ -68,7 +68,7 @@ def test_without_a_clear_entry_the_nearest_is_shown_and_the_status_is_1(capsys, 
     status, out, _ = run(capsys, "plan", str(path), "--entries")
     assert status == 1
     assert out.startswith("Entries: 0 are clear")
-    assert "nearest to it" in out
+    assert "none without motion of the guide; nearest" in out
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def map_entries(args: argparse.Namespace) -> int:
     scenario = choose_scenario(args)
     check_free(scenario)
     compile_first(scenario.setup.axes, phantoms=bool(scenario.zone))
-    folder = Folder.claim(args.out, run_name(args), "entries", scenario, args.seed)
+    folder = Folder.claim(args.out, run_name(args), "map", scenario, args.seed)
     with print_problems(folder), Progress() as progress:
         progress.begin("Mapping entries")
         found = record_entries(folder, scenario)
@@ -71,7 +71,7 @@ def _report(found: EntryMap, folder: Folder, *, as_json: bool) -> None:
     if shown := result["best"]:
         names = [f"{number}{'' if number > 1 else ' recommended'}" for number in range(1, len(shown) + 1)]
     else:
-        names, shown = ["none is clear; nearest to it"], [entry_rows(found)[found.order[0]]]
+        names, shown = ["none without motion of the guide; nearest"], [entry_rows(found)[found.order[0]]]
     axes = found.scenario.setup.axes
     print_table(title, _HEADS, [(name, *_cells(row, axes)) for name, row in zip(names, shown, strict=True)])
     print(_RANKED)

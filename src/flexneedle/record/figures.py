@@ -31,7 +31,7 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
-    if run.kind == "entries":
+    if run.kind == "map":
         return save(entries_figure(read_entries(folder, run.scenario)), folder, "entries")
     if not run.plans:
         raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")

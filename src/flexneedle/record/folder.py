@@ -1,6 +1,6 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
-`run.json` has format, kind ("plan", "insertion" or "entries"), status, reason, seed, versions, scenario, result, timing
+`run.json` has format, kind ("plan", "insertion" or "map"), status, reason, seed, versions, scenario, result, timing
 and plans; for an insertion also controller, controller_name, phantom, tracker, rig, dry_run and disturbed. A plan that
 chose where the needle enters has its own section `entry`; the scenario of an insertion has the entry of its plan. All
 except `timing`, the date and the wall-clock times, is the same for the same seed.

@@ -63,7 +63,7 @@ def unfinished_note(run: RunFile) -> str:
 
 
 def _require_plans(run: RunFile) -> RunFile:
-    if run.kind == "entries":
+    if run.kind == "map":
         raise RunError(f"{run.folder}: contains a map of entries, in {ENTRIES_FILE}, and no plan")
     if not run.plans:
         raise RunError(f"{run.folder}: the run ended before planning finished")

@@ -160,7 +160,7 @@ def _export(args: argparse.Namespace) -> int:
     from flexneedle.record.loading import load_insertion
 
     run = read_run(args.run)
-    if run.kind == "entries":
+    if run.kind == "map":
         paths = write_entries(read_entries(args.run, run.scenario), args.slicer)
     elif not run.plans:
         raise InputError(f"{args.run}: the run ended before planning finished")
