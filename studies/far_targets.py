@@ -40,7 +40,7 @@ _OTHER_SEED = 1
 
 def once(scenario: Scenario, target: tuple[float, float], seed: int = 0) -> Plan:
     """Return the plan of the first search alone: no miss is large enough for another."""
-    with patch.object(planner, "_PRECISE_MM", math.inf):
+    with patch.object(planner, "PRECISE_MM", math.inf):
         return flexneedle.plan(scenario, target, seed=seed, threads=1)
 
 

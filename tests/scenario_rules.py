@@ -45,7 +45,7 @@ NOT_NEGATIVE += _keys("""
     control.adaptive_mpc: run_out_sd_mm tilt_sd_mrad modulus_log_sd bevel_sd boundary_sd_mm variation_sd
     control.adaptive_mpc: residual_gain
     control.bevel_only: curvature_per_m flip_dead_band
-    control.broyden_mpc: update_gain guide_weight guide_effect
+    control.broyden_mpc: update_gain guide_weight guide_effect zone_weight
     control.ce_mpc: orientation_weight_mm curvature_per_m flip_dead_band
     control.resolved_rate: curvature_per_m flip_dead_band gain damping
     entry: free_radius_mm free_slope_mrad

@@ -9,7 +9,7 @@ import flexneedle
 from flexneedle.control import mpc
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.interface import is_at_depth
-from flexneedle.costs.terms import CE_MPC
+from flexneedle.costs.terms import CE_MPC, drop_zones
 from flexneedle.costs.weighted_sum import evaluate_cost, outputs_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.simulator import Simulator
@@ -114,11 +114,13 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
     controls = mpc.make_controls(scenario, state, grid, np.zeros((1, 4)), 40.0, roll=0.0)
     settings = mpc.CeMpc(horizon=1)
-    charged = CE_MPC.terms(
-        settings,
-        reference=reference,
-        orientation=settings.orientation_weight_mm,
-        nominal=nominal[:, [DG_Y, DG_Z]],
+    charged = drop_zones(
+        CE_MPC.terms(
+            settings,
+            reference=reference,
+            orientation=settings.orientation_weight_mm,
+            nominal=nominal[:, [DG_Y, DG_Z]],
+        )
     )
     trajectories = simulator.rollout(state, controls, **outputs_of(charged)._asdict())
     best = evaluate_cost(charged, trajectories).min()

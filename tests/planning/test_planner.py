@@ -294,8 +294,8 @@ NEAR_THE_SKIN = {
 def test_a_target_near_the_skin_that_one_search_misses_is_reached(where, monkeypatch):
     """Both searches have one history, in which the best cost never rises."""
     scenario, target = NEAR_THE_SKIN[where]
-    calls, found, carry_out = [], [], planner._carry_out
-    monkeypatch.setattr(planner, "_carry_out", lambda *args: found.append(carry_out(*args)) or found[-1])
+    calls, found, carry_out = [], [], planner.carry_out
+    monkeypatch.setattr(planner, "carry_out", lambda *args: found.append(carry_out(*args)) or found[-1])
     plan = flexneedle.plan(scenario, target, listeners=[lambda event: calls.append(event.info)])
     assert plan.error_mm <= 0.5
     assert plan.limit == ""
@@ -359,14 +359,14 @@ def test_a_force_of_the_guide_is_charged_if_it_has_a_limit():
 
 
 def test_the_tolerance_of_a_plan_is_a_spread_in_mm():
-    search = planner._search_settings(PHANTOM.with_values({"plan.tolerance_mm": 0.02}).plan, 64)
+    search = planner.search_settings(PHANTOM.with_values({"plan.tolerance_mm": 0.02}).plan, 64)
     assert (search.tolerance, search.relative) == (0.02, False)
 
 
 def test_a_plan_that_two_searches_miss_is_made_of_rolls_alone(monkeypatch):
     """Of the three plans the one of least cost as carried out is kept, though its search cost more."""
-    found, carry_out = [], planner._carry_out
-    monkeypatch.setattr(planner, "_carry_out", lambda *args: found.append(carry_out(*args)) or found[-1])
+    found, carry_out = [], planner.carry_out
+    monkeypatch.setattr(planner, "carry_out", lambda *args: found.append(carry_out(*args)) or found[-1])
     plan = flexneedle.plan(world(120))
     first, second, third = found
     assert min(first.error_mm, second.error_mm) > 0.1

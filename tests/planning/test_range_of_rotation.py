@@ -119,7 +119,7 @@ def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most,
     )
     goal = scenario.entry.lateral(DEPTH) + cmath.rect(1.0, math.radians(angle))
     problem = make_problem(scenario, (DEPTH, goal.real, goal.imag), STEER)
-    rollout = planner._make_rollout(Simulator(scenario, threads=1), ())
+    rollout = planner.make_rollout(Simulator(scenario, threads=1), ())
     expected = [reach() * least, reach() * greatest]
     np.testing.assert_allclose(steering.reach(rollout, problem), expected, rtol=0.02, atol=1e-6)
     assert problem.lateral == pytest.approx(1.0)

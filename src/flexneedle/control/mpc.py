@@ -7,7 +7,7 @@ import numpy as np
 from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.interface import Decision, travel_left
 from flexneedle.control.limits import guide_reach, largest_guide_step
-from flexneedle.costs.terms import CE_MPC
+from flexneedle.costs.terms import CE_MPC, drop_zones
 from flexneedle.costs.weighted_sum import outputs_of
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Variables, find_best
@@ -19,6 +19,7 @@ from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.simulator.control import MOVES, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
+from flexneedle.simulator.zones import zones_of
 from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, X, Y, Z
 
 _TOLERANCE = 1e-3  # spread of the elite's costs at convergence, relative to the first
@@ -72,9 +73,16 @@ def choose_step(
     )
     steps_of_guide = nominal[:, DG_Y : DG_Y + 2]
     weight = control.orientation_weight_mm
-    charged = CE_MPC.terms(
-        control, target=plan.target, reference=reference, orientation=weight, nominal=steps_of_guide
+    zones = zones_of(scenario)
+    terms = CE_MPC.terms(
+        control,
+        target=plan.target,
+        reference=reference,
+        orientation=weight,
+        nominal=steps_of_guide,
+        clear=zones.margin,
     )
+    charged = terms if zones else drop_zones(terms)
     wanted = outputs_of(charged)
     rollout = partial(simulator.rollout, state, outputs=wanted.outputs, at_end=wanted.at_end)
     found = find_best(variables, rollout, charged, search, rng)

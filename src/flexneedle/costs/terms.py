@@ -21,13 +21,13 @@ scenario with its weight, as `[[plan.terms]]`, `[[control.ce_mpc.terms]]` or
 The terms with sums over steps are from the paper (eq. 13) and depend on the length of a step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.costs.normal import moments_above_zero
-from flexneedle.costs.weighted_sum import Cost, Trajectories, Weight, cost_term
+from flexneedle.costs.weighted_sum import Cost, Term, Trajectories, Weight, cost_term
 from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, X, Y, across
 
 PLAN, CE_MPC, ADAPTIVE_MPC = Cost("plan"), Cost("ce_mpc"), Cost("adaptive_mpc")
@@ -36,8 +36,7 @@ Complexes = NDArray[np.complex128]
 _PLAN_PRECISION_MM = 0.1  # miss of a plan above which its square costs more than the miss itself
 ENERGIES = ("end energy", "mean energy", "peak energy")
 """Terms whose weights are per E₁, the energy of all tissue down to the target displaced by 1 mm."""
-ZONES = {"zones", "compression"}
-"""Terms of zones to avoid."""
+_ZONES = {"zones", "compression"}  # terms of zones to avoid
 SHARE_OF_LIMIT = 0.8
 """Share of a limit of the guard above which a load is charged."""
 _AT_LIMIT = 0.002  # share of a limit
@@ -48,6 +47,11 @@ def per_energy(weights: Mapping[str, float], scale: float) -> dict[str, float]:
     """Return weights by the names of terms with the weights of energies divided by a scale (mJ); 0 if it is 0."""
     factors = dict.fromkeys(ENERGIES, 1.0 / scale if scale > 0.0 else 0.0)
     return {name: weight * factors.get(name, 1.0) for name, weight in weights.items()}
+
+
+def drop_zones(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """Return terms without those for zones to avoid."""
+    return tuple(term for term in terms if term.name not in _ZONES)
 
 
 def past_target(tips: Floats, target: Point) -> Complexes:
@@ -172,6 +176,10 @@ def guide_force_excess(trajectories: Trajectories, force: float) -> Floats:
     adaptive_mpc=Weight(
         "zones", "zone_weight", "–", 60.0,
         "As `plan.zone_weight`.",
+    ),
+    ce_mpc=Weight(
+        "zones", "zone_weight_mm", "mm", 60.0,
+        "Weight of the distance by which the needle enters the margin of a zone to avoid, in mm² per mm.",
     ),
 )  # fmt: skip
 def intrusion(trajectories: Trajectories, clear: float, soft: float = 0.0) -> Floats:

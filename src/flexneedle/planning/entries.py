@@ -12,10 +12,10 @@ import numpy as np
 from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.errors import InputError
 from flexneedle.invasiveness import Invasiveness
+from flexneedle.planning.avoidance import make_room
 from flexneedle.planning.entry import add_along, read_entry
 from flexneedle.planning.entry_clearance import judge_best, measure_clearance
 from flexneedle.planning.entry_map import PRECISE_MM, EntryMap, Whole
-from flexneedle.planning.planner import make_room
 from flexneedle.planning.primitives import make_controls
 from flexneedle.planning.problem import ROUNDING, PlanProblem, make_problem
 from flexneedle.planning.ways import Responses, rate

@@ -14,6 +14,7 @@ import numpy as np
 
 from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories, evaluate_cost, evaluate_terms
 from flexneedle.planning import cross_entropy as ce
+from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import Floats
 
 OnIteration = Callable[[dict[str, Any]], None]
@@ -121,3 +122,16 @@ def count_iterations(progress: OnIteration, before: int, usual: int, least: floa
         progress({**info, "iteration": now, "iterations": max(now, usual), "best": min(info["best"], least)})
 
     return show
+
+
+def search_settings(plan: PlanSettings, samples: int) -> ce.Search:
+    """Return the search of a plan with a number of samples."""
+    return ce.Search(
+        samples=samples,
+        elite=ce.elite_count(samples, plan.elite_fraction),
+        iterations=max(plan.iterations, plan.max_iterations),
+        smoothing=plan.smoothing,
+        tolerance=plan.tolerance_mm,
+        usual=plan.iterations,
+        relative=False,
+    )

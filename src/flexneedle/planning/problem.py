@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.costs.terms import PLAN, ZONES, per_energy
+from flexneedle.costs.terms import PLAN, drop_zones, per_energy
 from flexneedle.costs.weighted_sum import Term
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
@@ -65,10 +65,8 @@ class PlanProblem:
         weights["guide force"] = weights["limits"]
         values = {**loads.values, "clear": 0.0 if self.clear is None else self.clear}
         terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **values)
-        without = {"guide force"} if np.isinf(loads.force) else set()
-        if self.clear is None:
-            without |= ZONES
-        return tuple(term for term in terms if term.name not in without)
+        terms = tuple(term for term in terms if term.name != "guide force" or np.isfinite(loads.force))
+        return drop_zones(terms) if self.clear is None else terms
 
     @property
     def entry_coordinates(self) -> int:

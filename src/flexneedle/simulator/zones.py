@@ -145,6 +145,13 @@ class ZoneMap:
         kernels.fill_least_distances(self.packed, flat, found)
         return found.reshape(points.shape[:-1]) - self.radius
 
+    def slopes(self, points: Floats) -> Floats:
+        """Return the derivatives (n, 3) of `least_clearances` at points (n, 3); 0 where these are far from zones."""
+        moved = points[:, None, None] + _SMALL_MM * np.array([1.0, -1.0])[:, None] * np.eye(3)[:, None]
+        found = self.least_clearances(moved)
+        slopes: Floats = (found[..., 0] - found[..., 1]) / (2.0 * _SMALL_MM)
+        return slopes
+
     def clearance_of(self, state: State) -> float:
         """Return the least clearance (mm) of a state; infinite before the skin."""
         return float(self.clearances(state.body).min(initial=np.inf)) if self else np.inf

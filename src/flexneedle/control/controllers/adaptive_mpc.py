@@ -31,7 +31,7 @@ from flexneedle.control.path import KNOTS, Ahead, GuidePath, path_of_plan
 from flexneedle.control.reserve import NO_RESERVE, Lever, reserve_of_bevel
 from flexneedle.control.samples import aim_samples, propose_samples
 from flexneedle.costs.normal import moments_above_zero
-from flexneedle.costs.terms import ADAPTIVE_MPC, ZONES, past_target, per_energy
+from flexneedle.costs.terms import ADAPTIVE_MPC, drop_zones, past_target, per_energy
 from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
@@ -286,7 +286,7 @@ def cost_terms(
         **reserve._asdict(),
         **memory.loads.values,
     )
-    return tuple(term for term in terms if term.name not in ZONES or memory.clear is not None)
+    return drop_zones(terms) if memory.clear is None else terms
 
 
 def expected_out_of_reach(

@@ -20,6 +20,7 @@ from flexneedle.estimation.task import Task
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
+from flexneedle.simulator.zones import ZoneMap, zones_of
 from flexneedle.types import DB_X, DG_Y, Control, Floats, X
 
 _LEAST_INSERTION_MM = 0.5  # between two updates: in a shorter one the tracker's noise dominates
@@ -39,6 +40,8 @@ class BroydenMpc(Section):
     """Largest lateral distance of the guide from the axis; at most `setup.max_guide_travel_mm`."""
     guide_weight: NonNegative = 0.000316
     """Weight of squared guide steps (mm²) relative to the squared deviation of the tip (mm²)."""
+    zone_weight: NonNegative = 30.0
+    """Weight of the squared distance (mm²) by which the tip enters the margin of a zone to avoid."""
     guide_effect: NonNegative = 0.982
     """Initial Jacobian: lateral motion of the tip per motion of the guide."""
 
@@ -134,14 +137,16 @@ def solve_guide_moves(
     """Return guide positions (n, g), mm, relative to the present ones (g,), and their cost.
 
     ahead (n,): travel of the tip (mm) at the end of each of n steps. Cost: squared distance (mm²) of tip and planned
-    path, and `guide_weight` times the squared guide steps.
+    path, `guide_weight` times the squared guide steps, and `zone_weight` times the squared distance to the margins of
+    zones of a tip that would enter them without these.
     """
     n, axes = len(ahead), guide.size
     goal = planned_offset(plan, tip[0] + ahead)[: tip.size - 1]
     effort = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
-    matrix = np.concatenate([np.kron(jacobian[1:, 1:], np.eye(n)), np.kron(np.eye(axes), effort)])
     left = goal - tip[1:, None] - np.multiply.outer(jacobian[1:, 0], ahead)
-    right = np.concatenate([left.ravel(), np.zeros(axes * n)])
+    away, inside = _lead_away(settings, zones_of(scenario), jacobian, tip, ahead)
+    matrix = np.concatenate([np.kron(jacobian[1:, 1:], np.eye(n)), np.kron(np.eye(axes), effort), away])
+    right = np.concatenate([left.ravel(), np.zeros(axes * n), inside])
     setup, home = scenario.setup, scenario.guide_home
     reach = min(settings.max_guide_travel_mm, setup.max_guide_travel_mm)
     guide = guide - np.array([home.real, home.imag])[:axes]
@@ -149,6 +154,22 @@ def solve_guide_moves(
     lower, upper = np.maximum(-furthest, -reach - place), np.minimum(furthest, reach - place)
     moves = bounded_least_squares(matrix, right, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
     return moves.reshape(axes, n).T, float(np.sum((matrix @ moves - right) ** 2))
+
+
+def _lead_away(
+    settings: BroydenMpc, zones: ZoneMap, jacobian: Floats, tip: Floats, ahead: Floats
+) -> tuple[Floats, Floats]:
+    """Return rows (n, g n), and their right-hand sides (n,), of motions out of margins that the tip would enter."""
+    n, axes = len(ahead), jacobian.shape[1] - 1
+    if not zones:
+        return np.empty((0, axes * n)), np.empty(0)
+    points = np.zeros((n, 3))
+    points[:, : tip.size] = tip + np.outer(ahead, np.append(1.0, jacobian[1:, 0]))
+    inside = np.maximum(zones.margin - zones.least_clearances(points), 0.0)
+    effect = zones.slopes(points)[:, 1 : tip.size] @ jacobian[1:, 1:] * (inside > 0.0)[:, None]
+    rows = np.concatenate([np.diag(column) for column in effect.T], axis=1)
+    weight = np.sqrt(settings.zone_weight)
+    return weight * rows, weight * inside
 
 
 def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:

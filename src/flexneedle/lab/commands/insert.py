@@ -90,8 +90,10 @@ class LinkedConnection(Connection):
             self._ros_bridge = stack.enter_context(Bridge(ros, print_line))
         if igtl is not None:
             from flexneedle.lab.igtl.bridge import IgtlBridge
+            from flexneedle.lab.images.frames import registration_of
 
-            self._igtl_bridge = stack.enter_context(IgtlBridge(igtl, print_line))
+            bridge = IgtlBridge(igtl, print_line, registration_of(scenario))
+            self._igtl_bridge = stack.enter_context(bridge)
         if self._ros_bridge is not None and ros is not None and ros.target:
             return with_target(scenario, self._ros_bridge.await_target())
         if self._igtl_bridge is not None and self.args.igtl_target:

@@ -15,6 +15,8 @@ from flexneedle.arguments import make_refusal, read_numbers
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import from_matrix, to_matrix
 from flexneedle.geometry.rigid import Rigid
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.zones import ImageSettings
 from flexneedle.types import Floats, Point, Quaternion
 
 LPS, RAS = "LPS", "RAS"
@@ -115,6 +117,14 @@ class ImageRegistration:
     def inverse(self) -> Rigid:
         """Return the map of points from the needle's frame to RAS."""
         return self.rigid.inverse()
+
+
+def registration_of(scenario: Scenario) -> ImageRegistration | None:
+    """Return the registration in the section `image` of a scenario; None if that is not set."""
+    image = scenario.image
+    if image == ImageSettings():
+        return None
+    return ImageRegistration(image.rotation, image.translation_mm, image.sd_mm)
 
 
 def check_matrix(name: str, matrix: ArrayLike) -> Floats:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from flexneedle.errors import RunError, one_line
 from flexneedle.lab.igtl.bridge import IgtlBridge
 from flexneedle.lab.igtl.settings import IgtlAddress, IgtlSettings
+from flexneedle.lab.images.frames import registration_of
 from flexneedle.lab.link.bridge import LinkBridge
 from flexneedle.lab.page.job_orders import JobChange
 from flexneedle.lab.page.worker.task import WorkerTask
@@ -40,7 +41,7 @@ class IgtlLink:
         def stop(why: str) -> None:
             task.control.take(JobChange(task.order.job, stop=why))
 
-        with bridge.insertion(_print, on_stop=stop):
+        with bridge.insertion(_print, registration_of(task.scenario), stop):
             yield {"igtl": bridge}
 
     def close(self) -> None:

@@ -1,0 +1,111 @@
+"""Plans that keep the margins of zones, found where a plan without zones does not (`planning.detours`)."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from flexneedle.planning.carry_out import carry_out, make_rollout
+from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.detours import refine, search_detours
+from flexneedle.planning.freedom import find_freedom
+from flexneedle.planning.horizon import OnIteration, count_iterations, search_settings
+from flexneedle.planning.primitives import Solution
+from flexneedle.planning.problem import PlanProblem
+from flexneedle.planning.ways import Room
+from flexneedle.results import Plan
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.excess import LoadLimits
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.zones import ZoneMap
+from flexneedle.types import Floats
+
+PRECISE_MM = 0.1
+"""Miss of a plan above which other searches are made."""
+_RESERVE_MM = 0.1  # of clearance in a search, beyond the margin
+_SKETCHED = 10  # iterations of a sketch after the race
+_REPEATS = 2  # of a search with more clearance, where the exact rod enters a margin
+_MENDED_MM = 1.5  # largest intrusion for which it is repeated
+_CLEAR_MM = 5.0  # cost of the margins of a plan that nearly keeps them by the simulator
+_OVERLOAD_MM = 10.0  # rank of a load beyond a limit of the guard
+
+
+def avoid_zones(
+    simulator: Simulator,
+    problem: PlanProblem,
+    zones: ZoneMap,
+    found: Plan,
+    rng: np.random.Generator,
+    progress: OnIteration,
+) -> Plan:
+    """Return the first plan that keeps all margins and reaches the target; of others, the best with what it lacks."""
+    around, search = _go_around(simulator, problem, zones), _search_settings(simulator)
+    shapes_of, room = make_rollout(simulator, (), at_end=("shapes",)), make_room(simulator.scenario, zones)
+    rollout, usual = make_rollout(simulator, around.terms), found.iterations + (search.usual or 0)
+    after = count_iterations(progress, found.iterations, usual, np.inf)
+    solutions = search_detours(rollout, shapes_of, around, room, search, rng, after)
+    best, history = found, found.history
+    for solution in solutions:
+        for repeat in range(1 + _REPEATS):
+            new = carry_out(simulator, problem, zones, found.strategy, found.seed, solution)
+            history = (*history, *new.history)
+            best = min(best, new, key=_rank)
+            near = 0.0 < new.intrusion_mm <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
+            if repeat == _REPEATS or not near:
+                break
+            farther = replace(around, clear=zones.margin + _RESERVE_MM + (1 + repeat) * new.intrusion_mm)
+            solution = refine(rollout, farther, solution, search, rng, progress)
+        if best.hit and best.error_mm <= PRECISE_MM:
+            break
+    best = replace(best, history=history, iterations=len(history))
+    if best.hit:
+        return best
+    help_by = find_freedom(shapes_of, around, room)
+    margin = f"zones.margin_mm = {zones.margin:g}"
+    return replace(best, limit=f"{margin}; {help_by} may suffice" if help_by else margin)
+
+
+def sketch_detour(
+    simulator: Simulator,
+    problem: PlanProblem,
+    zones: ZoneMap,
+    rng: np.random.Generator,
+    progress: OnIteration,
+) -> Solution:
+    """Return the best way past zones after a short search."""
+    around = _go_around(simulator, problem, zones)
+    shapes_of, room = make_rollout(simulator, (), at_end=("shapes",)), make_room(simulator.scenario, zones)
+    short = replace(_search_settings(simulator), iterations=_SKETCHED, usual=_SKETCHED)
+    return next(
+        search_detours(make_rollout(simulator, around.terms), shapes_of, around, room, short, rng, progress)
+    )
+
+
+def _go_around(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> PlanProblem:
+    """Return the problem with zones."""
+    length = simulator.scenario.needle.length_mm
+    return replace(problem, clear=zones.margin + _RESERVE_MM, length=length)
+
+
+def _search_settings(simulator: Simulator) -> Search:
+    plan = simulator.scenario.plan
+    return search_settings(plan, plan.samples)
+
+
+def _rank(plan: Plan) -> tuple[float, float]:
+    """Return the order of plans: by the intrusion into margins (mm) and the miss beyond what is precise, then cost."""
+    off = plan.intrusion_mm + max(0.0, plan.error_mm - PRECISE_MM)
+    return off + _OVERLOAD_MM * plan.limit.startswith("guard."), plan.cost
+
+
+def make_room(scenario: Scenario, zones: ZoneMap) -> Room:
+    """Return what first paths are judged by."""
+    curvature = 2.0 * LoadLimits.of(scenario).strain / scenario.needle.outer_diameter
+    return Room(zones.least_clearances, partial(_compression_lengths, scenario), curvature)
+
+
+def _compression_lengths(scenario: Scenario, depths: Floats) -> Floats:
+    """Return the compression lengths (p,), mm, of the layers at depths (p,)."""
+    layer = np.searchsorted(scenario.layer_tops, depths, side="right") - 1
+    lengths: Floats = np.array([each.compression_length_mm for each in scenario.tissue])[layer]
+    return lengths
