@@ -20,6 +20,7 @@ from flexneedle.cli.common import (
     run_name,
     target_row,
 )
+from flexneedle.cli.entries import map_entries
 from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
@@ -37,13 +38,21 @@ def add_parser(commands: Commands) -> None:
         "plan an insertion and draw the plan",
         _plan,
         "flexneedle plan phantom --target 40 1.5 --strategy both",
-        "flexneedle plan mine.toml --seed 3 --json",
+        "flexneedle plan mine.toml --entries",
     )
     add_run_arguments(parser)
     add_strategy(parser, "manipulation moves guide and bevel, steering only the bevel", "both")
+    parser.add_argument(
+        "--entries",
+        action="store_true",
+        help="instead of a plan: a map of the free entry points with clearance, load and tolerance, without motion of "
+        "the guide",
+    )
 
 
 def _plan(args: argparse.Namespace) -> int:
+    if args.entries:
+        return map_entries(args)
     from flexneedle.cli.progress import Progress
     from flexneedle.planning.events import Event, Iterated
     from flexneedle.record.folder import Folder

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from flexneedle.arguments import NARROWEST_MM, WIDEST_MM, make_refusal, read_numbers
 from flexneedle.errors import RunError
+from flexneedle.figures.entries import entries_figure
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import WIDTH, figures_of_width, save
+from flexneedle.record.entries import read_entries
 from flexneedle.record.folder import TRACE_FILE, read_run
 from flexneedle.record.loading import insertion_of, unfinished_note
 from flexneedle.results import Insertion, Plan, scenario_of
@@ -22,11 +24,15 @@ if TYPE_CHECKING:
 def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -> list[Path]:
     """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` if there are no periods; return the paths.
 
+    Of a map of entries, draw `entries.png` and `.svg`.
+
     note: called with a line if the record or its trace lacks its end.
 
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
+    if run.kind == "map":
+        return save(entries_figure(read_entries(folder, run.scenario)), folder, "entries")
     if not run.plans:
         raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")
     is_traced = run.kind == "insertion" and (folder / TRACE_FILE).exists()

@@ -1,9 +1,9 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
-`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and plans;
-for an insertion also controller, controller_name, phantom, tracker, rig, dry_run and disturbed. A plan that chose where
-the needle enters has its own section `entry`; the scenario of an insertion has the entry of its plan. All except
-`timing`, the date and the wall-clock times, is the same for the same seed.
+`run.json` has format, kind ("plan", "insertion" or "map"), status, reason, seed, versions, scenario, result, timing
+and plans; for an insertion also controller, controller_name, phantom, tracker, rig, dry_run and disturbed. A plan that
+chose where the needle enters has its own section `entry`; the scenario of an insertion has the entry of its plan. All
+except `timing`, the date and the wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -25,6 +25,7 @@ from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 
 RUN_FILE, TRACE_FILE, STUDY_FILE = "run.json", "trace.mcap", "study.json"
+ENTRIES_FILE = "entries.json"
 _PACKAGE = Path(__file__).parents[1]
 _SOURCES = (".py", ".toml", ".json")
 _DIGITS = 12

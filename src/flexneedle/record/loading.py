@@ -5,7 +5,7 @@ from pathlib import Path
 
 from flexneedle.arguments import check_path
 from flexneedle.errors import InputError, RunError
-from flexneedle.record.folder import TRACE_FILE, RunFile, read_run
+from flexneedle.record.folder import ENTRIES_FILE, TRACE_FILE, RunFile, read_run
 from flexneedle.results import Insertion, Outcome, Plan
 
 _UNFINISHED = "no end is recorded: the run was killed, its disk was full, or it is still running"
@@ -63,6 +63,8 @@ def unfinished_note(run: RunFile) -> str:
 
 
 def _require_plans(run: RunFile) -> RunFile:
+    if run.kind == "map":
+        raise RunError(f"{run.folder}: contains a map of entries, in {ENTRIES_FILE}, and no plan")
     if not run.plans:
         raise RunError(f"{run.folder}: the run ended before planning finished")
     return run

@@ -1,13 +1,16 @@
 """Plan with a record on disk: the work of the command `plan`, and the beginning of `insert`."""
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from flexneedle.errors import StoppedError
+from flexneedle.planning.entries import map_entries
+from flexneedle.planning.entry_map import EntryMap
 from flexneedle.planning.events import Listener
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.record.folder import Folder
-from flexneedle.record.saving import finish, finish_plans, keep_plan
+from flexneedle.record.saving import finish, finish_entries, finish_plans, keep_plan
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 
@@ -30,6 +33,19 @@ def record_plans(
             add_plan(folder, scenario, strategy, seed, listeners)
         finish_plans(folder)
     return folder.plans
+
+
+def record_entries(folder: Folder, scenario: Scenario) -> EntryMap:
+    """Map the entries of a scenario, and write `entries.json`, `run.json` and `entries.png`, `.svg` to the folder.
+
+    An error or an interruption is recorded in `run.json` and re-raised.
+    """
+    with record_status(folder):
+        begun = time.perf_counter()
+        found = map_entries(scenario)
+        folder.timing["map_seconds"] = time.perf_counter() - begun
+        finish_entries(folder, found)
+    return found
 
 
 def add_plan(

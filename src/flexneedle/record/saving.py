@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING, Any
 from flexneedle.arguments import check_path
 from flexneedle.control.controllers import with_controller_defaults
 from flexneedle.errors import RecordError, describe_error
+from flexneedle.files import replace_file
+from flexneedle.planning.entry_map import EntryMap
+from flexneedle.record.entries import entries_result, entry_rows
 from flexneedle.record.figures import draw_run
-from flexneedle.record.folder import TRACE_FILE, Folder
+from flexneedle.record.folder import ENTRIES_FILE, TRACE_FILE, Folder
+from flexneedle.record.plain import to_text
 from flexneedle.record.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.results import Insertion, Plan, scenario_of
 from flexneedle.scenario.model import Scenario
@@ -60,6 +64,14 @@ def keep_plan(folder: Folder, plan: Plan) -> None:
 def finish_plans(folder: Folder) -> None:
     """Record that all plans are complete, and draw them."""
     folder.values["result"] = {name: plan_result(plan) for name, plan in folder.plans.items()}
+    folder.end("done")
+    _draw(folder)
+
+
+def finish_entries(folder: Folder, found: EntryMap) -> None:
+    """Write a map of entries to `entries.json`, record that it is complete, and draw it."""
+    replace_file(folder.path / ENTRIES_FILE, to_text({"entries": entry_rows(found)}).encode())
+    folder.values["result"] = entries_result(found)
     folder.end("done")
     _draw(folder)
 

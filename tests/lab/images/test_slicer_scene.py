@@ -13,6 +13,8 @@ from flexneedle.lab.images.markups import read_markups
 from flexneedle.lab.images.meshes import read_mesh
 from flexneedle.lab.images.slicer_scene import write_scene
 from flexneedle.lab.images.transforms import read_transform
+from flexneedle.record.entries import read_entries
+from flexneedle.record.folder import read_run
 from flexneedle.scenario.files import load_scenario
 from lab.images.image_cases import VESSEL, to_ras, write_case
 
@@ -146,6 +148,25 @@ def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine):
     status, shown, _ = run(capsys, "image", "show", "abdomen/case.toml")
     (in_tmp / "mine.toml").write_text(shown)
     assert run(capsys, "scenario", "check", "mine.toml")[0] == 0
+
+
+@pytest.mark.usefixtures("drawing")
+def test_the_best_entries_of_an_image_are_on_its_skin(capsys, in_tmp):
+    """At the abdomen's target of example: points where the needle's frame has x = 0, labelled by the tolerance."""
+    run(capsys, "image", "example", "abdomen", "--spacing", "2", "2", "2")
+    assert run(capsys, "plan", "--image", "abdomen/case.toml", "--entries", "--out", "map")[0] == 0
+    status, out, _ = run(capsys, "export", "map", "--slicer", "scene")
+    assert status == 0
+    assert out.splitlines()[-1] == "frame: image (LPS in files)"
+    scenario = read_run(in_tmp / "map").scenario
+    found = read_entries(in_tmp / "map", scenario)
+    (markup,) = read_markups(in_tmp / "scene/entries.mrk.json")
+    best = found.best(10)
+    expected = image_from_needle(scenario, np.insert(found.points[best], 0, 0.0, axis=1))
+    np.testing.assert_allclose(markup.positions, expected, atol=EXACT)
+    label = f"{found.clearance_mm[best[0]]:.1f} mm from {found.zone_name(best[0])}, tolerance "
+    assert markup.points[0].label.startswith(f"{label}{found.offset_mm[best[0]]:.1f} mm, ")
+    assert (in_tmp / "scene/zone-1-ribs.ply").is_file()
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,8 @@ def add_parser(commands: Commands) -> None:
         "--slicer",
         type=expand_home,
         metavar="DIR",
-        help="write entry, target, paths, needle and zones of a run or plan for 3D Slicer, in the frame of its image",
+        help="write entry, target, paths, needle and zones of a run or plan, or best entries and zones of a map, for "
+        "3D Slicer, in the frame of the image",
     )
 
 
@@ -153,14 +154,17 @@ def _export(args: argparse.Namespace) -> int:
         return export(args)
     if args.csv is not None or args.readings is not None:
         raise InputError("--slicer: not with --csv or --readings: export one after the other")
-    from flexneedle.lab.images.slicer_scene import has_image, write_scene
+    from flexneedle.lab.images.slicer_scene import has_image, write_entries, write_scene
+    from flexneedle.record.entries import read_entries
     from flexneedle.record.folder import read_run
     from flexneedle.record.loading import load_insertion
 
     run = read_run(args.run)
-    if not run.plans:
+    if run.kind == "map":
+        paths = write_entries(read_entries(args.run, run.scenario), args.slicer)
+    elif not run.plans:
         raise InputError(f"{args.run}: the run ended before planning finished")
-    if run.kind == "insertion":
+    elif run.kind == "insertion":
         found, note = load_insertion(args.run)
         if note:
             print_note(note)

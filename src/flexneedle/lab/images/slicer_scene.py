@@ -1,4 +1,4 @@
-"""Files for 3D Slicer of a run: markups, models of needle and zones, and the transform to the image's frame."""
+"""Files for 3D Slicer of runs: markups, models of needle and zones, and the transform to the image's frame."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -16,12 +16,14 @@ from flexneedle.lab.images.meshes import Mesh, write_mesh
 from flexneedle.lab.images.surfaces import find_surface, make_tube
 from flexneedle.lab.images.transforms import write_transform
 from flexneedle.mechanics.zones import fill_distances
+from flexneedle.planning.entry_map import EntryMap
 from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.zones import ZoneMap, zones_of
 from flexneedle.types import Floats
 
 NEEDLE, TRANSFORM = "needle.ply", "needle-to-image.tfm"
+_ENTRIES = 10  # of a map, the best
 _APART_MM = 1e-3  # of points of a curve
 _BESIDE_MM, _SPACING_MM = 40.0, 1.0  # of the surfaces of zones
 
@@ -34,21 +36,41 @@ def write_scene(run: Insertion | dict[str, Plan], folder: Path) -> list[Path]:
     """
     plans = {run.plan.strategy: run.plan} if isinstance(run, Insertion) else run
     scenario = _scenario_of(run, next(iter(plans.values())))
+    shape = _shape_of(run, next(iter(plans.values())))
+    needle = make_tube(_distinct(shape), 0.5 * scenario.needle.outer_diameter)
+    return _write(scenario, [*_markups(scenario, run, plans, shape)], {NEEDLE: needle}, folder)
+
+
+def write_entries(found: EntryMap, folder: Path) -> list[Path]:
+    """Write the best entries of a map, with their clearance and tolerance, and the zones, as `write_scene` does."""
+    best = found.best(_ENTRIES)
+    points = np.insert(found.points[best], 0, 0.0, axis=1)
+    markup = _markup(POINTS, "entries", [_describe_entry(found, k) for k in best], points)
+    return _write(found.scenario, [markup], {}, folder)
+
+
+def _describe_entry(found: EntryMap, entry: int) -> str:
+    tolerance = f"tolerance {found.offset_mm[entry]:.1f} mm, {found.angle_mrad[entry]:.0f} mrad"
+    name = found.zone_name(entry)
+    return f"{found.clearance_mm[entry]:.1f} mm from {name}, {tolerance}" if name else tolerance
+
+
+def _write(
+    scenario: Scenario, markups: Sequence[Markup], meshes: dict[str, Mesh], folder: Path
+) -> list[Path]:
+    """Write markups, meshes, zones and the transform to the image's frame."""
     to_image = image_frame(scenario).inverse()
     path = check_path("folder", folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be created: {error.strerror}") from None
-    shape = _shape_of(run, next(iter(plans.values())))
-    markups = [*_markups(scenario, run, plans, shape)]
     names = [f"{_plain(each.name)}.mrk.json" for each in markups]
     for name, markup in zip(
         names, markups, strict=True
     ):  # older versions of 3D Slicer read the first one of a file
         write_markups([_map_markup(markup, to_image)], path / name)
-    meshes = {NEEDLE: make_tube(_distinct(shape), 0.5 * scenario.needle.outer_diameter)}
-    meshes |= dict(_zones(scenario))
+    meshes = {**meshes, **dict(_zones(scenario))}
     for name, mesh in meshes.items():
         write_mesh(Mesh(to_image.apply(mesh.points), mesh.triangles), path / name)
     write_transform(matrix(to_image), path / TRANSFORM)
