@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration wide worlds space worlds-space tuning slicer docs lint clean
+.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slicer docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -10,7 +10,7 @@ PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 # Targets that run scripts, each with a quick mode.
-SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration wide worlds space worlds-space tuning slow docs
+SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slow docs
 
 # With QUICK=1 each of them does everything that it does, on a few cases, in seconds; results go to a temporary folder.
 quick = $(if $(QUICK),$(1))
@@ -153,6 +153,11 @@ far-targets: setup  ## plans to targets up to the edge of the reach, near the sk
 
 plan-reach: setup  ## plans of 200 random worlds, and what a search of 20 times the size finds where they miss
 	$(BIN)/python studies/plan_reach.py $(call quick,--worlds 100000 1 --factor 2)
+
+rooms: setup  ## plans and insertions in random rooms with zones to avoid, and forced faults (hours)
+	$(BIN)/python studies/zone_rooms.py plans --larger 20 $(call quick,--count 1 --larger 1)
+	$(BIN)/python studies/zone_rooms.py loops --count 250 $(call quick,--count 1)
+	$(BIN)/python studies/zone_rooms.py loops --count 25 --sd 0 --displaced 3 --blind $(call quick,--count 1)
 
 tilted-skin: setup  ## insertions where skin and layers are deeper or shallower than planned, as by a tilted skin
 	$(BIN)/python studies/tilted_skin.py $(call quick,--worlds 100000 1)

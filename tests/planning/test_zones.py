@@ -1,4 +1,4 @@
-"""Plans that avoid zones: unchanged where nothing conflicts, clear by two models, and what is said where none is."""
+"""Plans that avoid zones: unchanged where nothing conflicts, clear by two models, refused with reasons otherwise."""
 
 import math
 from dataclasses import replace

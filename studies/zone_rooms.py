@@ -1,7 +1,7 @@
 """Random rooms: worlds with zones to avoid, in the plane and in space.
 
-    python studies/rooms.py plans [--first N] [--count N] [--larger FACTOR] [--jobs N] [--out FILE]
-    python studies/rooms.py loops [--first N] [--count N] [--sd MM] [--displaced MM] [--blind] [--jobs N] [--out FILE]
+    python studies/zone_rooms.py plans [--first N] [--count N] [--larger FACTOR] [--jobs N] [--out FILE]
+    python studies/zone_rooms.py loops [--first N] [--count N] [--sd MM] [--displaced MM] [--blind] [--jobs N] [--out FILE]
 
 A room is a wide world with about 1 to 6 zones beside the line from the entry to the target: spheres, capsules, boxes,
 curved vessels (of capsules) and walls with a gap. None has, with its margin, the target or the fixed entry in it. Each
