@@ -58,11 +58,11 @@ def avoid_zones(
         if best.hit and best.error_mm <= PRECISE_MM:
             break
     best = replace(best, history=history, iterations=len(history))
-    if best.hit:
+    if best.hit or best.limit.startswith("guard."):
         return best
+    limit = best.limit if best.intrusion_mm else "zones to avoid"
     help_by = find_freedom(shapes_of, around, room)
-    margin = f"zones.margin_mm = {zones.margin:g}"
-    return replace(best, limit=f"{margin}; {help_by} may suffice" if help_by else margin)
+    return replace(best, limit=f"{limit}; {help_by} may suffice" if help_by else limit)
 
 
 def sketch_detour(

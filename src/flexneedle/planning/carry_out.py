@@ -78,17 +78,11 @@ def _measure_clearance(
     plan = replace(plan, clearance=clearance, intrusion_mm=max(0.0, inside))
     if not plan.intrusion_mm or plan.refusal:
         return plan
-    refusal = _describe_intrusion(zones, deepest)
-    return replace(plan, refusal=refusal, limit=f"zones.margin_mm = {zones.margin:g}")
-
-
-def _describe_intrusion(zones: ZoneMap, clearances: Floats) -> str:
-    """Return the clearance, of some (z, n), that is deepest in its margin."""
-    least = clearances.min(axis=1, initial=np.inf)
+    least = deepest.min(axis=1, initial=np.inf)
     worst = int((least - zones.margins).argmin())
-    where = "from" if least[worst] >= 0.0 else "inside"
-    distance, margin = format_mm(abs(float(least[worst]))), zones.margins[worst]
-    return f"{distance} {where} zone {zones.names[worst]} (margin {margin:g} mm)"
+    distance = f"{format_mm(abs(float(least[worst])))} {'from' if least[worst] >= 0.0 else 'inside'}"
+    refusal = f"{distance} zone {zones.names[worst]} (margin {zones.margins[worst]:g} mm)"
+    return replace(plan, refusal=refusal, limit=f"zone {zones.names[worst]}")
 
 
 def fix_entry(
