@@ -159,7 +159,7 @@ def clearance_rows(
 def compile_first(*axes: int, phantoms: bool = True) -> None:
     """Compile the kernels for values of `setup.axes`, with a progress line if they are not in the cache.
 
-    phantoms: include the virtual phantoms, which a plan does not need.
+    phantoms: include the virtual phantoms, which a plan without zones does not need.
     """
     from flexneedle.cli.progress import Progress
     from flexneedle.phantom.kernels import compile_kernels, find_uncompiled

@@ -59,7 +59,7 @@ def _plan(args: argparse.Namespace) -> int:
     from flexneedle.record.plans import record_plans
 
     scenario = choose_scenario(args)
-    compile_first(scenario.setup.axes, phantoms=False)
+    compile_first(scenario.setup.axes, phantoms=bool(scenario.zone))
     strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with print_problems(folder), Progress() as progress:

@@ -33,8 +33,8 @@ def find_uncompiled(*axes: int, phantoms: bool = True) -> dict[str, float]:
 def compile_kernels(axes: int, *, phantoms: bool = True) -> None:
     """Compile the kernels for scenarios with `setup.axes`, or load them from the cache, ahead of their first call.
 
-    phantoms: compile the virtual phantoms too, which a plan does not need. One caller at a time: compiling in many
-    processes at once is slow, and has crashed. The other callers load what the first has compiled.
+    phantoms: compile the virtual phantoms too, which a plan without zones does not need. One caller at a time:
+    compiling in many processes at once is slow, and has crashed. The other callers load what the first has compiled.
     """
     scenario = load_scenario(_SCENARIOS[axes])
     with _alone(_mark("").with_name("lock")):
