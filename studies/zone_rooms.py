@@ -1,7 +1,7 @@
 """Random rooms: worlds with zones to avoid, in the plane and in space.
 
     python studies/zone_rooms.py plans [--first N] [--count N] [--larger FACTOR] [--jobs N] [--out FILE]
-    python studies/zone_rooms.py loops [--first N] [--count N] [--sd MM] [--displaced MM] [--blind] [--jobs N] [--out FILE]
+    python studies/zone_rooms.py loops [--first N] [--count N] [--sd MM] [--displaced MM] [--blind] [--out FILE]
 
 A room is a wide world with about 1 to 6 zones beside the line from the entry to the target: spheres, capsules, boxes,
 curved vessels (of capsules) and walls with a gap. None has, with its margin, the target or the fixed entry in it. Each
@@ -12,8 +12,9 @@ that without zones (CPU); clearances of the exact plant without mismatch, every 
 
 loops: insertions of clear plans into the exact plant with the mismatch that ships, zones displaced by a normal
 registration error with the standard deviation MM on each axis, of which the scenario knows (`image.sd_mm`), compared
-with the same insertions without zones. --displaced: by this distance in the worst of 12 directions, which the scenario
-does not know; --blind: a controller without the terms of zones.
+with insertions without zones, from the entry of their own plan and from the entry of the plan with zones. --displaced:
+by this distance in the worst of 12 directions, which the scenario does not know; --blind: a controller without the
+terms of zones.
 
 Rooms below 1000 are for tuning, those from 100,000 on for reports.
 """
@@ -282,8 +283,11 @@ def insert_room(
         used = used.with_values({"control.adaptive_mpc.zone_weight": 0.0})
     plan = _of(plan, used)
     done, true = flexneedle.insert(used, plan, seed=number, threads=1, force=bool(displaced)), zones_of(there)
-    without = scenario.with_values({"zone": []})
-    plain = flexneedle.insert(without, flexneedle.plan(without, threads=1), seed=number, threads=1)
+    without, there_too = (each.with_values({"zone": []}) for each in (scenario, plan.scenario))
+    plain, same = (
+        flexneedle.insert(each, flexneedle.plan(each, threads=1), seed=number, threads=1)
+        for each in (without, there_too)
+    )
     least = min(
         (true.clearances(p.true_shape).min() for p in done.periods if p.true_shape is not None),
         default=np.inf,
@@ -293,6 +297,7 @@ def insert_room(
         "estimated": min(p.clearance for p in done.periods), "planned": plan.least_clearance_mm,
         "outcome": str(done.outcome), "reason": done.reason, "error": done.true_error_mm,
         "plan_error": plan.error_mm, "outcome_without": str(plain.outcome), "error_without": plain.true_error_mm,
+        "outcome_same": str(same.outcome), "error_same": same.true_error_mm,
     }  # fmt: skip
 
 
@@ -314,22 +319,22 @@ def _worst_shift(scenario: Scenario, plan: Plan, size: float, space: bool) -> An
 def print_loops(rows: list[dict[str, Any]]) -> None:
     """Print a line for free and fixed entries."""
     print(
-        "|entry|insertions|zones touched|margin entered by > 0.1 mm|held|held without zones|mean error|without zones|"
+        "|entry|insertions|touched|margin entered by > 0.1 mm|held|held without zones"
+        "|mean error|without zones|… from the same entry|"
     )
-    print("|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|")
     for free in (True, False):
         own = [row for row in rows if row["free"] == free]
-        done = [row for row in own if row["outcome"] == row["outcome_without"] == "done"]
-        held, held_without = (
-            sum(row[key] != "done" for row in own) for key in ("outcome", "outcome_without")
+        outcomes, errors = (
+            [f"{name}{case}" for case in ("", "_without", "_same")] for name in ("outcome", "error")
         )
-        means = [
-            np.mean([row[key] for row in done]) if done else np.nan for key in ("error", "error_without")
-        ]
+        done = [row for row in own if all(row[key] == "done" for key in outcomes)]
+        held, held_without = (sum(row[key] != "done" for row in own) for key in outcomes[:2])
+        means = [np.mean([row[key] for row in done]) if done else np.nan for key in errors]
         print(
             f"|{'free' if free else 'fixed'}|{len(own)}|{sum(row['clearance'] < 0.0 for row in own)}"
             f"|{sum(row['clearance'] < _MARGIN_MM - 0.1 for row in own)}|{held}|{held_without}"
-            f"|{means[0]:.4f} mm|{means[1]:.4f} mm|"
+            f"|{' mm|'.join(f'{mean:.4f}' for mean in means)} mm|"
         )
 
 
