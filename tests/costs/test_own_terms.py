@@ -65,7 +65,7 @@ def test_controllers_charge_it_too():
     settings = check_tables(scenario).control.tables["ce_mpc"]
     assert settings["terms"][0]["weight"] == 3.0
     names = [weight.name for _, weight in CE_MPC.rows()]
-    assert names == ["deviation", "guide", "energy"]
+    assert names == ["zones", "deviation", "guide", "energy"]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from flexneedle.cli.common import (
     run_name,
     target_row,
 )
-from flexneedle.cli.entries import map_entries
 from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
@@ -52,6 +51,8 @@ def add_parser(commands: Commands) -> None:
 
 def _plan(args: argparse.Namespace) -> int:
     if args.entries:
+        from flexneedle.cli.entries import map_entries
+
         return map_entries(args)
     from flexneedle.cli.progress import Progress
     from flexneedle.planning.events import Event, Iterated
