@@ -26,9 +26,12 @@ from flexneedle.ports import Driver
 from flexneedle.results import Action, Insertion, Outcome, Period, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import ROUNDING_S, travel_time
+from flexneedle.simulator.state import State
+from flexneedle.simulator.zones import ZoneMap
 from flexneedle.types import STILL, UNKNOWN, Control, Lateral, Motion, Pose, X
 
 _MOST_MOVES = 4  # times the planned steps; then the insertion fails
+_TOLERANCE_MM = 0.1  # by which a margin may be entered without a warning
 _Ending = tuple[Outcome, str]
 
 
@@ -117,6 +120,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         ending = _ending(task, state)
         period = _make_period(index, now, task, rig, step, motion.control, observation, clocks)
         warning = warn_of_miss(step.decision, state.in_a_row) or step.decision.doubt
+        warning = warning or _warn_of_zone(steering.guard.zones, observation.estimate.state)
         yield replace(period, warning=warning, **_clearances(steering, period, observation)), ending
         if ending is not None:
             return
@@ -268,6 +272,16 @@ def _clearances(steering: Steering, period: Period, observation: Observation) ->
         "clearance": zones.clearance_of(observation.estimate.state),
         "true_clearance": None if true is None else float(zones.shape_clearances(true)),
     }
+
+
+def _warn_of_zone(zones: ZoneMap, state: State) -> str:
+    """Return a warning if the estimated needle is in the margin of a zone by more than a tolerance, else ""."""
+    if not zones or not (body := state.body).size:
+        return ""
+    near = zones.nearest(body)
+    if near.clearance >= near.margin - _TOLERANCE_MM:
+        return ""
+    return f"{format_mm(near.clearance)} from zone {near.zone}, in its margin of {near.margin:g} mm"
 
 
 def _pair(miss: float | complex) -> Lateral:

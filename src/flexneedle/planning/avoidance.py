@@ -27,6 +27,8 @@ _SKETCHED = 10  # iterations of a sketch after the race
 _REPEATS = 2  # of a search with more clearance, where the exact rod enters a margin
 _MENDED_MM = 1.5  # largest intrusion for which it is repeated
 _CLEAR_MM = 5.0  # cost of the margins of a plan that nearly keeps them by the simulator
+_NEARLY_MM = 1.5  # of intrusion and miss, for which a last search with more samples is made
+_MORE = 3
 _OVERLOAD_MM = 10.0  # rank of a load beyond a limit of the guard
 
 
@@ -44,25 +46,50 @@ def avoid_zones(
     rollout, usual = make_rollout(simulator, around.terms), found.iterations + (search.usual or 0)
     after = count_iterations(progress, found.iterations, usual, np.inf)
     solutions = search_detours(rollout, shapes_of, around, room, search, rng, after)
-    best, history = found, found.history
+    tries = _Tries(found)
     for solution in solutions:
         for repeat in range(1 + _REPEATS):
-            new = carry_out(simulator, problem, zones, found.strategy, found.seed, solution)
-            history = (*history, *new.history)
-            best = min(best, new, key=_rank)
+            new = tries.add(
+                carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution
+            )
             near = 0.0 < new.intrusion_mm <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
             if repeat == _REPEATS or not near:
                 break
             farther = replace(around, clear=zones.margin + _RESERVE_MM + (1 + repeat) * new.intrusion_mm)
             solution = refine(rollout, farther, solution, search, rng, progress)
-        if best.hit and best.error_mm <= PRECISE_MM:
+        if tries.found:
             break
-    best = replace(best, history=history, iterations=len(history))
+    if not tries.found and tries.solution is not None and _off(tries.best) <= _NEARLY_MM:
+        more = replace(search, samples=_MORE * search.samples, elite=_MORE * search.elite)
+        solution = refine(rollout, around, tries.solution, more, rng, progress)
+        tries.add(carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution)
+    best = replace(tries.best, history=tries.history, iterations=len(tries.history))
     if best.hit or best.limit.startswith("guard."):
         return best
-    limit = best.limit if best.intrusion_mm else "zones to avoid"
-    help_by = find_freedom(shapes_of, around, room)
+    closest = zones.closest(best.shapes)
+    limit = best.limit if best.intrusion_mm or closest is None else f"zone {closest.zone}"
+    help_by = find_freedom(shapes_of, around, room, simulator.scenario.guard.zone_buffer_mm)
     return replace(best, limit=f"{limit}; {help_by} may suffice" if help_by else limit)
+
+
+class _Tries:
+    """The best of the plans that were tried, its solution, and the history of all."""
+
+    def __init__(self, found: Plan) -> None:
+        self.best, self.history = found, found.history
+        self.solution: Solution | None = None
+
+    def add(self, plan: Plan, solution: Solution) -> Plan:
+        """Add a plan and return it."""
+        self.history = (*self.history, *plan.history)
+        if _rank(plan) < _rank(self.best):
+            self.best, self.solution = plan, solution
+        return plan
+
+    @property
+    def found(self) -> bool:
+        """Whether the best plan keeps all margins and reaches its target."""
+        return self.best.hit
 
 
 def sketch_detour(
@@ -93,9 +120,13 @@ def _search_settings(simulator: Simulator) -> Search:
 
 
 def _rank(plan: Plan) -> tuple[float, float]:
-    """Return the order of plans: by the intrusion into margins (mm) and the miss beyond what is precise, then cost."""
-    off = plan.intrusion_mm + max(0.0, plan.error_mm - PRECISE_MM)
-    return off + _OVERLOAD_MM * plan.limit.startswith("guard."), plan.cost
+    """Return the order of plans: by what they lack (mm), then cost."""
+    return _off(plan) + _OVERLOAD_MM * plan.limit.startswith("guard."), plan.cost
+
+
+def _off(plan: Plan) -> float:
+    """Return the intrusion of a plan into margins and its miss beyond what is precise (mm)."""
+    return plan.intrusion_mm + max(0.0, plan.error_mm - PRECISE_MM)
 
 
 def make_room(scenario: Scenario, zones: ZoneMap) -> Room:

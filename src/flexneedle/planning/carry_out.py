@@ -19,6 +19,7 @@ from flexneedle.simulator.zones import ZoneMap
 from flexneedle.types import DB_X, DG_Y, DG_Z, Floats, X
 
 _DEPTH_TOLERANCE_MM = 1e-6
+_ROUNDING_MM = 1e-3  # of an intrusion
 _OUTPUTS = ("energy", "stretch", "strain", "loads", "shapes", "clearance")
 
 
@@ -75,7 +76,7 @@ def _measure_clearance(
         least, deepest = np.minimum(least, exact.min(axis=0)), exact
         inside = float((zones.margins[:, None] - exact).max())
     clearance = np.append(np.inf, np.where(plan.tips[1:, X] > 0.0, least, np.inf))
-    plan = replace(plan, clearance=clearance, intrusion_mm=max(0.0, inside))
+    plan = replace(plan, clearance=clearance, intrusion_mm=inside if inside > _ROUNDING_MM else 0.0)
     if not plan.intrusion_mm or plan.refusal:
         return plan
     least = deepest.min(axis=1, initial=np.inf)

@@ -4,7 +4,7 @@ from flexneedle.errors import InputError
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 
-PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "entry", "target", "plan")
+PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "entry", "target", "image", "zones", "zone", "plan")
 """Sections of a scenario that a plan depends on. It may be carried out with any other controller, tracker, monitor or
 phantom."""
 

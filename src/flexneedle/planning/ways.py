@@ -64,7 +64,7 @@ class Ways:
     bends: Laterals
     depths: Floats
 
-    def take(self, which: slice) -> "Ways":
+    def take(self, which: slice | NDArray[np.intp]) -> "Ways":
         """Return some of the paths."""
         return Ways(self.z[which], self.paths[which], self.bodies[which], self.bends[which], self.depths)
 

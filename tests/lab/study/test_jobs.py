@@ -213,3 +213,17 @@ def test_only_one_process_writes_a_journal(tmp_path):
         StudyJournal(tmp_path / "j", 5)
     with StudyJournal(tmp_path / "j", 5) as again:
         assert again.rows == {}
+
+
+def test_a_stored_plan_keeps_the_entry_that_it_has_chosen(point, tmp_path):
+    """And points that differ in their zones have plans of their own."""
+    free = replace(point, scenario=point.scenario.with_values({"entry.free_slope_mrad": 100.0}))
+    zone = {"shape": "sphere", "name": "artery", "center_mm": [20.0, 9.0, 0.0], "radius_mm": 1.0}
+    zoned = replace(free, scenario=free.scenario.with_values({"zone": [zone]}))
+    wide = replace(free, scenario=zoned.scenario.with_values({"zones.margin_mm": 3.0}))
+    keys = [digest_plan_inputs(each) for each in (free, zoned, wide)]
+    assert len({*keys}) == 3
+    StudyPlans(tmp_path).keep(keys[1], make_plan(zoned))
+    stored = StudyPlans(tmp_path).plan_for(keys[1], zoned)
+    assert not stored.scenario.entry.free
+    assert stored.tips[0, 1] == pytest.approx(stored.scenario.entry.lateral(stored.tips[0, 0]).real)

@@ -39,11 +39,12 @@ class InsertionJob:
 
 @dataclass(frozen=True)
 class PlanResult:
-    """A plan by field and its planning time (s), or the reason why planning failed."""
+    """A plan by field and its planning time (s), or the reason why planning failed; the chosen entry by field."""
 
     values: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     refusal: str = ""
+    entry: dict[str, float] = field(default_factory=dict)
 
 
 def make_plan(point: StudyPoint) -> PlanResult:
@@ -53,7 +54,8 @@ def make_plan(point: StudyPoint) -> PlanResult:
         made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
     except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
         return PlanResult(refusal=f"no plan: {describe_error(error)}")
-    return PlanResult(plan_values(made), made.seconds)
+    chosen = made.scenario.entry.model_dump() if made.scenario and point.scenario.entry.free else {}
+    return PlanResult(plan_values(made), made.seconds, entry=chosen)
 
 
 def run_job(job: InsertionJob) -> list[dict[str, Any]]:

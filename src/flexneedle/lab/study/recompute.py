@@ -47,7 +47,7 @@ def recompute(
     row, made_by = _find_row(recorded, index), _describe_version(recorded)
     one = recorded.insertion(index)
     scenario, key = one.point.scenario, digest_plan_inputs(one.point)
-    plan = StudyPlans(folder / PLANS_FOLDER).plan(key)
+    plan = StudyPlans(folder / PLANS_FOLDER).plan_for(key, one.point)
     if plan is None:
         why = f"; the study was made by {made_by}" if made_by else ""
         raise InputError(f"{folder}: row {index}: its plan {PLANS_FOLDER}/{key}.json is missing{why}")

@@ -134,8 +134,9 @@ class _Engine:
         self._report_progress()
 
     def _submit(self, calls: "_PendingCalls", chunk: int, key: str) -> None:
-        made, refusal = self.plans.plan(key), self.plans.refusals.get(key, "")
+        refusal = self.plans.refusals.get(key, "")
         for point, insertions in self._pending[key]:
+            made = self.plans.plan_for(key, point)
             for first in range(0, len(insertions), chunk):
                 chosen = insertions[first : first + chunk]
                 job = InsertionJob(point, made, refusal, chosen, id(point) in self._reach_points)
