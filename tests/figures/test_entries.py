@@ -1,5 +1,6 @@
 """The figure of a map of entries, by its artists."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -53,3 +54,28 @@ def test_discs_at_the_entry_points_in_space(width, panels):
     np.testing.assert_allclose(discs[-1].get_offsets()[:, ::-1], entries.points[entries.clear])
     np.testing.assert_allclose(discs[-1].get_array(), entries.offset_mm[entries.clear])
     assert any(name.startswith("zone, silhouette") for name in names(figure.legends[0]))
+
+
+@pytest.mark.parametrize("name", ["phantom", "phantom3d"])
+def test_without_clear_entries_or_without_zones_no_panel_is_empty(name):
+    some, none = found(name), np.zeros_like(found(name).clear)
+    unclear = entries_figure(replace(some, clear=none, offset_mm=0.0 * some.offset_mm))
+    free = entries_figure(replace(some, clearance_mm=np.full(len(none), np.inf)))
+    for figure, panels in ((unclear, 2), (free, 1)):
+        assert len([ax for ax in figure.axes if ax.get_label() != "<colorbar>"]) == panels
+
+
+def test_names_of_zones_are_inside_and_the_margin_is_in_the_colour_bar():
+    long = {"name": "rib", "shape": "box", "center_mm": [10.0, 3.0, 0.0], "size_mm": [6.0, 3.0, 90.0]}
+    values = {**FREE, "zone": [long, {**SPHERE, "center_mm": [15.0, -10.9, 0.0]}]}
+    some = replace(found("phantom3d"), scenario=flexneedle.load_scenario("phantom3d").with_values(values))
+    figure = entries_figure(some)
+    figure.draw_without_rendering()
+    (ax,) = axes(figure, "offset along")
+    assert "rib" in {text.get_text() for text in ax.texts}
+    assert "vessel" not in {text.get_text() for text in ax.texts}  # only its edge is shown
+    (rib,) = (text for text in ax.texts if text.get_text() == "rib")
+    box = rib.get_window_extent()
+    assert ax.bbox.x0 < box.x0 < box.x1 < ax.bbox.x1
+    bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
+    assert [len(bar.texts) for bar in bars] == [1, 0, 0, 0]

@@ -11,7 +11,7 @@ from flexneedle.planning.entries import map_entries
 from flexneedle.planning.second_opinion import exact_clearances
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.zones import zones_of
-from flexneedle.types import X
+from flexneedle.types import ROLL, X
 
 FREE = {"entry.free_radius_mm": 10.0, "entry.free_slope_mrad": 200.0, "needle.nodes": 31}
 SPHERE = {"name": "vessel", "shape": "sphere", "center_mm": [15.0, 3.0, 0.0], "radius_mm": 1.5}
@@ -58,6 +58,29 @@ def test_numbers_are_those_of_the_insertion_from_the_fixed_entry(found):
         if clearance >= zones.margin:  # the bound is for this distance, or a larger one
             assert zones.clearances(done.shapes[0, ..., :3]).min() + zones.added.max() >= clearance
         assert np.hypot(*found.slopes[k]) <= 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_without_zones_the_gentlest_rolls_are_taken(name):
+    """Along the energy, neighbours hardly differ, and a roll on the way would be a multiple of the least."""
+    found = map_entries(SCENARIOS[name].with_values({"zone": []}))
+    energy = found.peak_energy_uj[found.clear]
+    assert found.clear.sum() > 50
+    middle = np.abs(found.points[found.clear] - [2.0, 0.0]).max(axis=1) < 5.0
+    assert energy[middle].max() < 1.2 * energy.min()
+    for k in np.flatnonzero(found.clear)[::40]:
+        simulator = Simulator(found.scenario_at(k), threads=1)
+        rows = found.controls[k][found.controls[k, :, X] > 0.0]
+        rolled = rows.copy()
+        rolled[len(rows) // 2, ROLL] += np.pi
+        peaks = [
+            simulator.rollout(
+                simulator.start(found.rolls[k]), each[None], outputs=("energy",), limits=False
+            ).energy.max()
+            for each in (rows, rolled)
+        ]
+        np.testing.assert_allclose(found.peak_energy_uj[k], 1e3 * peaks[0], rtol=1e-5)
+        assert peaks[0] < peaks[1]
 
 
 def test_clear_entries_keep_the_margin_of_each_zone(found):

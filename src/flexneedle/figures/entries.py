@@ -32,6 +32,9 @@ _SQUARE = {"clearance along": "Clearance (mm)", "offset along": "Tolerance (mm)"
 _LAYERS, _CELLS = 40, 120  # of the silhouette of a zone
 _SKIN_MM, _DEEP_MM = 0.01, 1e9
 _BOX = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 0.6}
+_EDGE = 0.15  # of the axes, without names
+_CENTRAL = 0.1  # mm of depth in a zone for 1 mm nearer to the middle
+_LONGEST = 16  # characters of a name
 _ROOM = 1.08  # of the disc of entries around it
 
 
@@ -57,25 +60,29 @@ def entries_figure(found: EntryMap) -> Figure:
                 _draw_curve(ax, found, quantity)
             _name_entry(list(axes.values()))
         else:
-            names = [name for name in shown if name in _SQUARE or not is_column()]
-            rows = [names] if is_column() else [names[:2], names[2:]]
-            figure, axes = mosaic(title, 8.2, rows, [1.0] * len(rows), [1.0, 1.0])
+            names = [name for name in shown if name in _SQUARE or not is_column()] or list(shown)
+            rows = [names[k : k + 2] for k in range(0, len(names), 2)]
+            figure, axes = mosaic(title, 4.1 * len(rows), rows, [1.0] * len(rows), [1.0] * len(rows[0]))
             for name in names:
                 _draw_discs(axes[name], found, shown[name])
-                if is_column():
+                if is_column() and name in _SQUARE:
                     axes[name].set_title(_SQUARE[name])
         legend_of(figure, axes.values())
     return figure
 
 
 def _quantities(found: EntryMap) -> dict[str, _Quantity]:
-    known = found.reached & np.isfinite(found.clearance_mm)
-    return {
-        "clearance along": _Quantity("Clearance from zones (mm)", found.clearance_mm, known),
-        "offset along": _Quantity("Tolerance of the entry point (mm)", found.offset_mm, found.clear),
-        "angle": _Quantity("Tolerance of the angle (mrad)", found.angle_mrad, found.clear),
-        "energy": _Quantity("Peak energy of the tissue (µJ)", found.peak_energy_uj, found.reached),
+    """Return the quantities that are known of any entry; the energy of clear ones if there are any."""
+    loaded = found.clear if found.clear.any() else found.reached
+    zoned = np.isfinite(found.clearance_mm)
+    every = {
+        "clearance along": _Quantity("Clearance from zones (mm)", found.clearance_mm, found.reached & zoned),
+        "offset along": _Quantity("Tolerance of the entry point (mm)", found.offset_mm, found.clear & zoned),
+        "angle": _Quantity("Tolerance of the angle (mrad)", found.angle_mrad, found.clear & zoned),
+        "energy": _Quantity("Peak energy of the tissue (µJ)", found.peak_energy_uj, loaded),
     }
+    some = {name: each for name, each in every.items() if each.known.any()}
+    return some or {"clearance along": every["clearance along"]}
 
 
 # ---- plane
@@ -128,10 +135,29 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
     if quantity.known.any():
         discs.set_array(quantity.values[quantity.known])
         figure: Any = ax.figure
-        figure.colorbar(discs, ax=ax, shrink=0.8, pad=0.02).outline.set_visible(False)
+        bar = figure.colorbar(discs, ax=ax, shrink=0.8, pad=0.02)
+        bar.outline.set_visible(False)
+        if quantity.title.startswith("Clearance"):
+            _mark_margins(bar.ax, found.scenario)
     scene.draw_target(ax, found.scenario.target.position, scene.ALONG)
     for number, k in enumerate(found.best(1 if is_column() else NUMBERED), 1):
         _mark(ax, found.points[k], number)
+
+
+def _mark_margins(bar: Axes, scenario: Scenario) -> None:
+    """Mark the margins in the colour bar that it covers."""
+    low, high = bar.get_ylim()
+    for margin in sorted(set(zones_of(scenario).margins.tolist())):
+        if low < margin < high:
+            bar.axhline(margin, color=INK, linewidth=1.6)
+            how: dict[str, Any] = {
+                "xytext": (-3, 0),
+                "textcoords": "offset points",
+                "ha": "right",
+                "va": "center",
+            }
+            place = bar.get_yaxis_transform()
+            bar.annotate("margin", (0.0, margin), xycoords=place, fontsize=small(), **how)
 
 
 def _set_up(ax: Axes, scenario: Scenario, title: str) -> None:
@@ -184,14 +210,21 @@ def _draw_zones(ax: Axes, scenario: Scenario) -> None:
             if least.min() < 0.0:
                 ax.contourf(z, y, least, [-_DEEP_MM, 0.0], colors=[ZONE], alpha=alpha, zorder=1)
                 ax.contour(z, y, least, [0.0], colors=[ZONE], linewidths=0.8, zorder=4)
-        deepest = np.unravel_index(int(each.min(axis=0).argmin()), each.shape[1:])
         if each.min() < 0.0:
-            where = float(z[deepest[1]]), float(y[deepest[0]])
             ax.fill([], [], color=ZONE, alpha=0.16, label="zone, silhouette (darker at the skin)")
             if not is_column():
-                _name(ax, where, name)
+                _name(ax, z, y, each.min(axis=0), name)
 
 
-def _name(ax: Axes, where: tuple[float, float], name: str) -> None:
+def _name(ax: Axes, z: Floats, y: Floats, distances: Floats, name: str) -> None:
+    """Write the name of a zone where it is deep, near the middle; not at the edge, where it would be cut."""
+    edge = round(_EDGE * len(z))
+    right, up = np.meshgrid(z[edge:-edge], y[edge:-edge])
+    inner = distances[edge:-edge, edge:-edge]
+    away = np.hypot(right - z.mean(), up - y.mean())
+    k = int((inner + _CENTRAL * away).argmin())
+    if inner.flat[k] >= 0.0:
+        return
+    where = float(right.flat[k]), float(up.flat[k])
     how: dict[str, Any] = {"color": ZONE, "fontsize": small(), "ha": "center", "va": "center"}
-    ax.text(*where, name, bbox=_BOX, zorder=5, clip_on=True, **how)
+    ax.text(*where, short(name, _LONGEST), bbox=_BOX, zorder=5, clip_on=True, **how)

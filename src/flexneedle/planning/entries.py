@@ -1,7 +1,9 @@
 """Maps of entry points: from which the target is reached, with what clearance, load and tolerance.
 
-Each entry gets the slope and the pattern of rolls that suit it best, without motion of the guide. The best few are
-chosen by superposition (`planning.ways`) and carried out, with the slope corrected by the miss.
+Each entry gets the slope and the pattern of rolls that suit it best, without motion of the guide. The best few and
+the gentlest of the good ones are chosen by superposition (`planning.ways`) and carried out, with the slope corrected by
+the miss. Of patterns that differ little in clearance, the one with the least energy is taken: a roll that gains a few
+tenths of a millimetre may load the tissue ten times as much.
 """
 
 from dataclasses import replace
@@ -26,7 +28,9 @@ from flexneedle.simulator.zones import ZoneMap, zones_of
 from flexneedle.types import DB_X, DB_Z, PSI, ROLL, THETA, Flags, Floats, Laterals, X, Y, Z, across
 
 _COUNTS = {1: 121, 2: 600}  # of entries, about, by the number of axes
-_TRIED = 3  # patterns of each entry that are carried out
+_TRIED = 3  # patterns of each entry that are carried out, of the best and of the gentlest
+_LITTLE_MM = 0.5  # of clearance or tolerance, by which a pattern is not better than a gentler one
+_DIGITS = 6  # of energies (mJ): smaller differences are rounding errors
 _ROUNDS = 3  # of corrections
 _RESERVE_MM = 0.1  # of clearance beyond the margin, for which superposed paths are charged
 _MISS = 10.0  # cost of a miss by a slope that is not free, since nothing corrects it
@@ -49,9 +53,7 @@ def map_entries(scenario: str | Path | Scenario, *, threads: int | None = None) 
     problem = replace(usual, clear=zones.margin + _RESERVE_MM, length=scenario.needle.length_mm)
     z, number = _superpose(simulator, problem, zones)
     found = _carry_out(simulator, problem, zones, *_correct(simulator, problem, z))
-    order = found.order
-    _, first = np.unique(number[order], return_index=True)
-    return judge_best(found.take(order[first]))
+    return judge_best(found.take(_choose(found, number)))
 
 
 def check_free(scenario: Scenario) -> None:
@@ -66,7 +68,7 @@ def _superpose(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> tu
     start = simulator.start()
 
     def rollout(controls: Floats) -> Trajectories:
-        return simulator.rollout(start, controls, at_end=("shapes",), limits=False)
+        return simulator.rollout(start, controls, outputs=("energy",), at_end=("shapes",), limits=False)
 
     responses, point = Responses.of(rollout, problem), _grid(problem)
     ends = responses.patterns.paths[:, -1]
@@ -77,9 +79,26 @@ def _superpose(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> tu
     ways = responses.enter(pattern.ravel(), point[entry.ravel()], slope.ravel())
     costs = rate(problem, ways, make_room(simulator.scenario, zones)).reshape(slope.shape)
     costs += _MISS * (steep - 1.0) * problem.entry[1] * problem.target[0]
+    alone = rollout(make_controls(problem, responses.patterns.z)[0]).energy.max(axis=1)
     best = np.argsort(costs, axis=1, kind="stable")[:, :_TRIED]
+    worse = costs > costs.min(axis=1, keepdims=True) + _LITTLE_MM
+    gentle = np.lexsort((costs, np.where(worse, np.inf, np.round(alone, _DIGITS))))[:, :_TRIED]
+    best = np.concatenate([best, gentle], axis=1)
     chosen = np.arange(len(point))[:, None] * slope.shape[1] + best
     return ways.z[chosen.ravel()], np.repeat(np.arange(len(point)), best.shape[1])
+
+
+def _choose(found: EntryMap, number: Whole) -> Whole:
+    """Return the insertion that is taken from each entry, of those with the numbers (N,) of their entries."""
+    value = np.where(found.clear, found.room_mm, np.where(found.reached, found.clearance_mm, -found.error_mm))
+    rank, chosen = found.reached.astype(int) + found.clear, []
+    for entry in np.unique(number):
+        own = np.flatnonzero(number == entry)
+        own = own[rank[own] == rank[own].max()]
+        own = own[value[own] >= value[own].max() - _LITTLE_MM]
+        energy = np.round(1e-3 * found.peak_energy_uj[own], _DIGITS)
+        chosen.append(own[np.lexsort((-value[own], energy))[0]])
+    return np.array(chosen)
 
 
 def _grid(problem: PlanProblem) -> Laterals:
