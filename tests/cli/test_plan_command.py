@@ -1,16 +1,21 @@
 """`flexneedle plan`: results, records, exit status."""
 
 import json
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+import flexneedle
 from commands import names, run
-from flexneedle.cli.common import clearance_rows
+from flexneedle.cli.common import clearance_rows, out_of_reach_rows
 from flexneedle.invasiveness import format_number
-from zoned import SPHERE, with_zones
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.simulator.zones import zones_of
+from zoned import SPHERE, grid_files, with_zones
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
+FREE = {"entry.free_radius_mm": 5.0, "entry.free_slope_mrad": 100.0}
 STRATEGIES = ("manipulation", "steering")
 PLAN_KEYS = [
     *(
@@ -74,3 +79,43 @@ def test_the_row_of_the_clearance_names_the_nearest_zone_with_its_margin():
     before = [straight - [40.0, 0.0, 0.0, 0.0, 0.0]]
     assert clearance_rows(scenario, "least", np.inf, before) == {"least": "not in the tissue"}
     assert clearance_rows(scenario.with_values({"zone": []}), "least", np.inf, shapes) == {}
+
+
+@pytest.mark.parametrize("command", [("plan",), ("plan", "--entries"), ("insert",)])
+def test_a_zone_file_that_cannot_be_read_leaves_no_folder(command, engine, capsys, in_tmp):
+    engine()
+    free = with_zones(
+        "phantom", {"name": "a", "shape": "file", "file": str(in_tmp / "a.seg.nrrd"), "label": 1}
+    )
+    (in_tmp / "a.toml").write_text(dump_scenario(free.with_values(FREE)))
+    status, _, err = run(capsys, command[0], "a.toml", *command[1:], "--out", "here")
+    assert (status, err.splitlines()[-1].startswith("flexneedle: zone a: ")) == (2, True)
+    assert names(in_tmp) == ["a.toml"]
+
+
+@pytest.mark.parametrize("options", [(), ("--entries",)])
+def test_a_target_in_a_margin_is_refused_before_the_search(options, capsys, in_tmp):
+    depth, lateral, _ = load_scenario("phantom").target.position
+    near = {**SPHERE, "center_mm": [depth, lateral + 4.5, 0.0]}
+    scenario = with_zones("phantom", near).with_values(FREE)
+    (in_tmp / "a.toml").write_text(dump_scenario(scenario))
+    status, _, err = run(capsys, "plan", "a.toml", *options)
+    assert status == 1
+    assert "flexneedle: target: 1.50 mm from zone node, within its margin" in err
+    assert names(in_tmp) == ["a.toml"]
+
+
+def test_a_zone_out_of_reach_is_named_without_a_clearance(in_tmp):
+    with (
+        grid_files(in_tmp) as ring,
+        patch("flexneedle.simulator.zones.load_part", lambda *_: lambda *_: None),
+    ):
+        scenario = with_zones("phantom", ring)
+        straight = np.pad(np.arange(-60.0, 41.0)[:, None], ((0, 0), (0, 4)))
+        assert clearance_rows(scenario, "least", np.inf, [straight]) == {}
+        assert out_of_reach_rows(scenario) == {"zone ring": "out of the needle's reach"}
+        zones = zones_of(scenario)
+        assert zones.clearances(straight[:, :3]).min() == np.inf
+        plan = flexneedle.plan(scenario)
+        assert plan.least_clearance_mm == np.inf
+        assert plan.refusal == ""

@@ -58,11 +58,11 @@ def test_a_map_comes_back_from_its_folder(zoned, capsys, in_tmp):
 
 
 def test_without_a_clear_entry_the_nearest_is_shown_and_the_status_is_1(capsys, in_tmp):
-    beside = {**SPHERE, "center_mm": [40.0, 5.0, 0.0]}
+    before = {**SPHERE, "center_mm": [20.0, 2.0, 0.0], "radius_mm": 12.0}
     path = in_tmp / "close.toml"
     path.write_text(
         dump_scenario(
-            PLANE.with_values({"zone": [beside], "target.depth_mm": 40.0, "target.lateral_mm": 2.0})
+            PLANE.with_values({"zone": [before], "target.depth_mm": 40.0, "target.lateral_mm": 2.0})
         )
     )
     status, out, _ = run(capsys, "plan", str(path), "--entries")

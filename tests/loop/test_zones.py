@@ -55,7 +55,7 @@ def test_a_command_that_would_enter_the_buffer_of_a_zone_is_refused(plan, off, r
     reason = guard.refusal(estimate, Control(db_x=1.0))
     assert bool(reason) == refused
     if refused:
-        assert reason.startswith("guard: clearance from zone artery ")
+        assert reason.startswith("guard: clearance from zone artery would be ")
 
 
 def test_in_the_buffer_a_needle_may_lead_away_but_not_nearer(plan):

@@ -57,6 +57,14 @@ def test_readings_that_arrive_stale_are_in_doubt():
     )
 
 
+def test_the_file_of_a_zone_without_an_image_is_in_doubt():
+    zone = {"name": "a", "shape": "file", "file": "a.stl"}
+    scenario = PHANTOM.with_values({"zone": [zone]})
+    (found,) = find_doubts(scenario)
+    assert found.startswith("zone a: file in the image's frame")
+    assert find_doubts(scenario.with_values({"image.sd_mm": 0.3})) == []
+
+
 def test_every_value_that_is_off_has_its_line():
     off = {"target.depth_mm": 0.07, "needle.youngs_modulus_gpa": 2e5, "tissue.1.thickness_mm": 3.0}
     assert len(find_doubts(PHANTOM.with_values(off))) == 3

@@ -48,6 +48,17 @@ def test_a_target_out_of_reach_from_the_entry_is_refused():
     assert line == "target.lateral_mm = 5.0: must be from 5.5 to 36.5, in reach of the guide from the entry"
 
 
+def test_zones_differ_in_name_and_a_common_margin_is_refused_once():
+    ball = {"name": "a", "shape": "sphere", "center_mm": [20.0, 5.0, 0.0], "radius_mm": 1.0}
+    values = {**PHANTOM.values(), "zone": [ball, {**ball, "name": "b"}]}
+    assert problems({**values, "zones": {"margin_mm": 0.1}}) == [
+        "zones.margin_mm = 0.1: must be at least guard.zone_buffer_mm (0.5)"
+    ]
+    assert problems({**values, "zone": [ball, ball]}) == [
+        'zone[1].name = "a": must differ from the name of zone[0]'
+    ]
+
+
 @pytest.mark.parametrize(("key", "value", "rule"), RULES, ids=lambda part: str(part)[:30])
 def test_a_broken_rule_is_one_line(key, value, rule):
     (line,) = problems(changed(key, value))

@@ -143,17 +143,30 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
 def clearance_rows(
     scenario: Scenario, title: str, clearance: float, shapes: Iterable[Floats]
 ) -> dict[str, str]:
-    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle; none without zones."""
+    """Return the row of a table for the least clearance (mm) of shapes (n, ≥ 3) of the needle.
+
+    There is none without zones in reach.
+    """
     import numpy as np
 
     from flexneedle.simulator.zones import zones_of
 
     if not scenario.zone:
         return {}
-    near = zones_of(scenario).closest(np.stack(list(shapes)), clearance)
+    zones = zones_of(scenario)
+    if len(zones.out_of_reach) == len(zones.names):
+        return {}
+    near = zones.closest(np.stack(list(shapes)), clearance)
     if near is None:
         return {title: "not in the tissue"}
     return {title: f"{near.clearance:.3f} mm to {near.zone} (margin {near.margin:g} mm)"}
+
+
+def out_of_reach_rows(scenario: Scenario) -> dict[str, str]:
+    """Return a row of a table for each zone that the needle cannot reach."""
+    from flexneedle.simulator.zones import zones_of
+
+    return {f"zone {name}": "out of the needle's reach" for name in zones_of(scenario).out_of_reach}
 
 
 def compile_first(*axes: int, phantoms: bool = True) -> None:

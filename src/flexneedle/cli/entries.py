@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 from flexneedle.cli.common import (
     choose_scenario,
     compile_first,
+    out_of_reach_rows,
     print_json,
     print_problems,
     print_table,
     run_name,
     target_row,
 )
+from flexneedle.cli.progress import print_note
 from flexneedle.errors import InputError
 from flexneedle.invasiveness import format_number
 from flexneedle.planning import STRATEGIES
@@ -43,12 +45,16 @@ def map_entries(args: argparse.Namespace) -> int:
     from flexneedle.planning.entries import check_free
     from flexneedle.record.folder import Folder
     from flexneedle.record.plans import record_entries
+    from flexneedle.simulator.zones import target_intrusion
 
     if args.strategy != STRATEGIES[0]:
         raise InputError("--strategy: not with --entries, whose insertions are steered by the bevel alone")
     scenario = choose_scenario(args)
     check_free(scenario)
     compile_first(scenario.setup.axes, phantoms=bool(scenario.zone))
+    if problem := target_intrusion(scenario):
+        print_note(problem)
+        return 1
     folder = Folder.claim(args.out, run_name(args), "map", scenario, args.seed)
     with print_problems(folder), Progress() as progress:
         progress.begin("Mapping entries")
@@ -75,6 +81,8 @@ def _report(found: EntryMap, folder: Folder, *, as_json: bool) -> None:
     axes = found.scenario.setup.axes
     print_table(title, _HEADS, [(name, *_cells(row, axes)) for name, row in zip(names, shown, strict=True)])
     print(_RANKED)
+    for name, note in out_of_reach_rows(found.scenario).items():
+        print(f"{name}: {note}")
     print(f"Record and figure: {folder.path}")
 
 
@@ -87,7 +95,7 @@ def _cells(row: dict[str, Any], axes: int) -> tuple[str, ...]:
         point,
         slope,
         "–" if row["clearance_mm"] is None else f"{row['clearance_mm']:.2f}",
-        row["zone"] or "–",
+        "–" if row["clearance_mm"] is None else row["zone"],
         f"{row['length_mm']:.1f}",
         f"{format_number(row['peak_energy_uj'])}, {format_number(row['mean_energy_uj'])}",
         _at_least(row["offset_mm"], MOST_OFFSET_MM, 2),

@@ -132,6 +132,7 @@ def _insert(args: argparse.Namespace) -> int:
     from flexneedle.loop.choices import Choices
     from flexneedle.loop.insertions import check_choices
     from flexneedle.record.folder import Folder
+    from flexneedle.simulator.zones import zones_of
 
     if args.list:
         return _list()
@@ -142,6 +143,7 @@ def _insert(args: argparse.Namespace) -> int:
             scenario = connection.with_registration(choose_scenario(args, choices.controller))
         with _print_refusal(args, choices, scenario):
             check_choices(scenario, args.strategy, choices)
+            zones_of(scenario)  # a file that cannot be used leaves no folder
             scenario = connection.start(stack, scenario)
             compile_first(scenario.setup.axes)
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flexneedle.cli.common import clearance_rows, entry_rows, print_json, print_table, target_row
+from flexneedle.cli.common import (
+    clearance_rows,
+    entry_rows,
+    out_of_reach_rows,
+    print_json,
+    print_table,
+    target_row,
+)
 from flexneedle.cli.progress import print_note
 
 if TYPE_CHECKING:
@@ -47,6 +54,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("  planned", _number(result["planned_error_mm"], "mm")),
         *_registration(scenario, insertion),
         *_clearance(scenario, insertion),
+        *out_of_reach_rows(scenario).items(),
         *_invasiveness(insertion),
         ("control periods", str(result["steps"])),
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),

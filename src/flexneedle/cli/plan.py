@@ -14,12 +14,14 @@ from flexneedle.cli.common import (
     clearance_rows,
     compile_first,
     entry_rows,
+    out_of_reach_rows,
     print_json,
     print_problems,
     print_table,
     run_name,
     target_row,
 )
+from flexneedle.cli.progress import print_note
 from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
@@ -58,9 +60,13 @@ def _plan(args: argparse.Namespace) -> int:
     from flexneedle.planning.events import Event, Iterated
     from flexneedle.record.folder import Folder
     from flexneedle.record.plans import record_plans
+    from flexneedle.simulator.zones import target_intrusion
 
     scenario = choose_scenario(args)
     compile_first(scenario.setup.axes, phantoms=bool(scenario.zone))
+    if problem := target_intrusion(scenario):
+        print_note(problem)
+        return 1
     strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with print_problems(folder), Progress() as progress:
@@ -99,6 +105,7 @@ def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:
         "planned tip to target": format_mm(plan.error_mm),
         f"entry angle{'s' if scenario.setup.axes > 1 else ''}": "none" if isnan(plan.entry_angle) else angles,
         **clearance_rows(scenario, "least clearance", plan.least_clearance_mm, plan.shapes),
+        **out_of_reach_rows(scenario),
         **plan.invasiveness.rows(),
         "cost (mm)": f"{plan.cost:.3g}",
         **{f"  {name}": f"{value:.3g}" for name, value in plan.terms.items()},

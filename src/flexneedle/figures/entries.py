@@ -130,7 +130,10 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
     _draw_zones(ax, found.scenario)
     other = found.reached & ~quantity.known
     _add_discs(ax, found, ~found.reached, 0.2, color=QUIET, label="target not reached")
-    _add_discs(ax, found, other, 0.4, color=BAD, label="in the margin of a zone, or in a zone")
+    inside = other & ~found.clear
+    _add_discs(ax, found, inside, 0.4, color=BAD, label="in the margin of a zone, or in a zone")
+    if (away := other & found.clear).any():
+        _add_discs(ax, found, away, 0.4, color=ESTIMATE, label="no zone in reach")
     discs = _add_discs(ax, found, quantity.known, 0.92, cmap=_COLORS)
     if quantity.known.any():
         discs.set_array(quantity.values[quantity.known])

@@ -89,5 +89,7 @@ class Guard:
             return Excess(-math.inf, "")
         found = self.zones.clearances(body)
         zone, least = int(found.min(axis=1).argmin()), float(found.min())
-        text = f"clearance from zone {self.zones.names[zone]} {format_mm(least)} < {self.buffer:g} mm"
+        text = (
+            f"clearance from zone {self.zones.names[zone]} would be {format_mm(least)} < {self.buffer:g} mm"
+        )
         return Excess(self.buffer - least, text, key="zone_buffer_mm")

@@ -7,6 +7,7 @@ from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import key_path
+from flexneedle.scenario.sections.zones import ImageSettings, ZoneFile
 
 
 class Range(NamedTuple):
@@ -96,10 +97,15 @@ _FAR = 10**0.5  # ratio to the nearest usual value from which a value is reporte
 def find_doubts(scenario: Scenario) -> list[str]:
     """Return a line for each value that is implausible.
 
-    A value is implausible if it is half an order of magnitude or more outside the usual range, if it has no effect, or
-    if it holds the needle from the start.
+    A value is implausible if it is half an order of magnitude or more outside the usual range, if it has no effect, if
+    it holds the needle from the start, or if it is the file of a zone in the frame of an unknown image.
     """
-    return [*_unusual(scenario), *_find_unused(scenario), *_stale(scenario)]
+    return [
+        *_unusual(scenario),
+        *_find_unused(scenario),
+        *_stale(scenario),
+        *_without_image(scenario),
+    ]
 
 
 def _unusual(scenario: Scenario) -> Iterator[str]:
@@ -133,6 +139,16 @@ def _stale(scenario: Scenario) -> Iterator[str]:
         rule = f"readings arrive {_short(age)} s old, above control.stale_after_s ({limit:g}), and hold the needle"
         remedy = "lower it, or raise control.stale_after_s"
         yield f"phantom.delay_periods = {periods:g}: {rule}: {remedy} (setup.insertion_speed_mm_s is low)"
+
+
+def _without_image(scenario: Scenario) -> Iterator[str]:
+    if scenario.image == ImageSettings():
+        for zone in scenario.zone:
+            if isinstance(zone, ZoneFile):
+                yield (
+                    f"zone {zone.name}: file in the image's frame, but the scenario has no [image]: taken as the "
+                    "needle's frame"
+                )
 
 
 def _general(key: str) -> str:

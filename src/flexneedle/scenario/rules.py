@@ -76,12 +76,19 @@ def entry_problems(setup: Setup, entry: Entry) -> Iterator[Problem]:
 
 
 def zone_problems(zones: Sequence[Zone], settings: ZoneSettings, guard: GuardSettings) -> Iterator[Problem]:
-    """Yield margins that the guard would not let a plan use, and files of zones with both a segment and a label."""
-    for i, zone in enumerate(zones):
-        margin = settings.margin_mm if zone.margin_mm is None else zone.margin_mm
-        if margin < guard.zone_buffer_mm:
-            key = "zones.margin_mm" if zone.margin_mm is None else f"zone.{i}.margin_mm"
+    """Yield margins that the guard would not let a plan use, names given twice, and files with segment and label."""
+    margins = {f"zone.{i}.margin_mm": zone.margin_mm for i, zone in enumerate(zones)}
+    if None in margins.values():
+        margins = {"zones.margin_mm": settings.margin_mm, **margins}
+    for key, margin in margins.items():
+        if margin is not None and margin < guard.zone_buffer_mm:
             yield Problem(key, margin, f"must be at least guard.zone_buffer_mm ({guard.zone_buffer_mm:g})")
+    names = [zone.name for zone in zones]
+    for i, zone in enumerate(zones):
+        if zone.name in names[:i]:
+            yield Problem(
+                f"zone.{i}.name", zone.name, f"must differ from the name of zone[{names.index(zone.name)}]"
+            )
         if isinstance(zone, ZoneFile) and zone.segment is not None and zone.label is not None:
             yield Problem(f"zone.{i}.label", zone.label, "leave it out: segment names the voxels")
 

@@ -32,8 +32,6 @@ GROUP = "flexneedle.images"
 _SMALL_MM = 1e-4  # for slopes of distances
 _BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
 _STEEP = 0.05  # by which the distance of two contacts may exceed their spacing
-_ANYWHERE_MM = 1e6
-_NOWHERE_MM = -1e9
 _BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
 
 
@@ -89,6 +87,7 @@ class ZoneMap:
         exact: The zones for results, larger by what is added, with distances at any distance.
         radius: Radius of the needle (mm).
         spacing: Largest distance (mm) between two points of the needle for which clearances are bounds.
+        out_of_reach: Names of the zones that the needle cannot reach; distances from them are infinite.
     """
 
     names: tuple[str, ...]
@@ -99,6 +98,7 @@ class ZoneMap:
     exact: kernels.Zones
     radius: float
     spacing: float
+    out_of_reach: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.names)
@@ -225,9 +225,24 @@ def _zones_of(
     made = [_SHAPES[type(zone)](zone, image, workspace) for zone in zones]
     shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
     packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
-    rows = kernels.pack(shapes, _ANYWHERE_MM, added).rows
-    exact = kernels.Zones(rows, packed.fields, _ANYWHERE_MM)
-    return ZoneMap(tuple(zone.name for zone in zones), least, margins, added, packed, exact, radius, spacing)
+    exact = kernels.Zones(kernels.pack(shapes, np.inf, added).rows, packed.fields, np.inf)
+    names = tuple(zone.name for zone in zones)
+    away = tuple(name for name, (shape, _) in zip(names, made, strict=True) if shape is _NOWHERE)
+    return ZoneMap(names, least, margins, added, packed, exact, radius, spacing, away)
+
+
+def target_intrusion(scenario: Scenario) -> str:
+    """Return which zone's margin the target is in, "" for none. Raises InputError for a file that cannot be used."""
+    if not scenario.zone:
+        return ""
+    zones, target = zones_of(scenario), np.array(scenario.target.position)
+    for name, distance, kept in zip(zones.names, zones.distances(target), zones.kept, strict=True):
+        if distance < kept:
+            return (
+                f"target: {distance:.2f} mm from zone {name}, within its margin: must be at least {kept:.2f} mm "
+                "(margin, what is added to it, and radius of the needle)"
+            )
+    return ""
 
 
 def sag(spacing: float, distance: float) -> float:
@@ -273,6 +288,7 @@ def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[floa
 # ---- shapes, each with a bound (mm) of the error of its distances
 
 _Made = tuple[kernels.Zone, float]
+_NOWHERE = kernels.half_space((-np.inf, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
 def _sphere(zone: sections.Sphere, _image: object, _workspace: object) -> _Made:
@@ -297,7 +313,7 @@ def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Wor
     to_needle = Rigid(to_matrix(np.array(image.rotation)), np.array(image.translation_mm))
     found: DistanceGrid | None = reader(zone, to_needle, workspace)
     if found is None:
-        return kernels.half_space((_NOWHERE_MM, 0.0, 0.0), (1.0, 0.0, 0.0)), 0.0
+        return _NOWHERE, 0.0
     return kernels.grid(found.values, found.first, np.full(3, found.spacing)), found.bound
 
 

@@ -75,6 +75,16 @@ def test_the_clearance_of_a_zone_is_from_where_the_vessel_is(folder):
     assert clear - 1.2 < found < clear + 0.5  # a voxel to either side, and the bound
 
 
+def test_what_is_added_to_the_margin_of_a_zone_is_printed(folder):
+    """Twice the registration's 0.5 mm, and the rest."""
+    made = import_case(write_case(folder))
+    added = zones_of(made.scenario).added[0] - 1.0
+    (line,) = [line for line in made.lines if line.startswith("zone to avoid: ")]
+    assert line == (
+        f"zone to avoid: vessel, margin 3 mm + 1 mm registration + {added:.2g} mm voxels and contacts"
+    )
+
+
 @pytest.mark.parametrize("tilt_deg", [5.0, 12.0])
 def test_a_tilted_skin_is_a_plane_whose_tilt_is_reported(folder, tilt_deg):
     """Insertion in the plane x, y of the layers, with the same entry."""

@@ -23,6 +23,8 @@ from flexneedle.scenario.alternatives import SHEAR, YOUNG
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.library import label
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.zones import REGISTRATION_SDS
+from flexneedle.simulator.zones import zones_of
 from flexneedle.types import Floats
 
 _SMALLEST_MM = 1.0  # distance of target and entry
@@ -271,9 +273,19 @@ def _describe(case: ImageCase, scenario: Scenario, skin: Skin, layers: Layers) -
         for each, tissue in zip(layers.runs, scenario.tissue, strict=True):
             end = "on" if each is layers.runs[-1] else f"to {each.end:.1f} mm"
             yield f"  from {each.top:.1f} {end}: {tissue.name}, shear modulus {tissue.shear_modulus_kpa:g} kPa"
-    for zone in scenario.zone:
-        margin = scenario.zones.margin_mm if zone.margin_mm is None else zone.margin_mm
-        yield f"zone to avoid: {zone.name}, margin {margin:g} mm"
+    yield from _describe_zones(scenario)
+
+
+def _describe_zones(scenario: Scenario) -> Iterator[str]:
+    """Yield zones with their margins and what is added to these."""
+    zones, registration = zones_of(scenario), REGISTRATION_SDS * scenario.image.sd_mm
+    for name, margin, added in zip(zones.names, zones.margins, zones.added, strict=True):
+        if name in zones.out_of_reach:
+            yield f"zone to avoid: {name}, out of the needle's reach"
+            continue
+        parts = {"registration": registration, "voxels and contacts": added - registration}
+        more = "".join(f" + {size:.2g} mm {of}" for of, size in parts.items() if size)
+        yield f"zone to avoid: {name}, margin {margin:g} mm{more}"
 
 
 def _doubts(
