@@ -216,7 +216,7 @@ def test_only_one_process_writes_a_journal(tmp_path):
 
 
 def test_a_stored_plan_keeps_the_entry_that_it_has_chosen(point, tmp_path):
-    """And points that differ in their zones have plans of their own."""
+    """And points that differ in their zones have separate plans."""
     free = replace(point, scenario=point.scenario.with_values({"entry.free_slope_mrad": 100.0}))
     zone = {"shape": "sphere", "name": "artery", "center_mm": [20.0, 9.0, 0.0], "radius_mm": 1.0}
     zoned = replace(free, scenario=free.scenario.with_values({"zone": [zone]}))
