@@ -12,9 +12,9 @@ that without zones (CPU); clearances of the exact plant without mismatch, every 
 
 loops: insertions of clear plans into the exact plant with the mismatch that ships, zones displaced by a normal
 registration error with the standard deviation MM on each axis, of which the scenario knows (`image.sd_mm`), compared
-with insertions without zones, from the entry of a plan without zones and from the entry of the plan with zones. --displaced:
-by this distance in the worst of 12 directions, which the scenario does not know; --blind: a controller without the
-terms of zones.
+with insertions without zones, from the entry of a plan without zones and from the entry of the plan with zones.
+--displaced: by this distance in the worst of 12 directions, which the scenario does not know; --blind: a controller
+without the terms of zones.
 
 Rooms below 1000 are for tuning, those from 100,000 on for reports.
 """

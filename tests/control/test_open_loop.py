@@ -71,11 +71,15 @@ def test_readings_change_nothing(quick_plan, estimated, along):
     assert blind == seeing == pytest.approx(tuple(quick_plan.controls[20]))
 
 
-def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, estimated, along):
+def test_it_has_arrived_once_the_steps_are_used_up_and_carried_out(quick_plan, estimated, along):
+    """A needle that was held has not."""
     task, count = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), len(quick_plan.controls)
-    far = estimated(along(quick_plan, 5))
-    assert not OPEN.arrived(task, count - 1, far)
-    assert OPEN.arrived(task, count, far)
+    end = estimated(along(quick_plan, count))
+    assert not OPEN.arrived(task, count - 1, end)
+    assert OPEN.arrived(task, count, end)
+    held = estimated(along(quick_plan, 5))
+    assert not OPEN.arrived(task, count, held)
+    assert OPEN.decide(task, count, held, None)[0].command.db_x > 0.0
 
 
 def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, estimated):

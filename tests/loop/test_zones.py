@@ -96,3 +96,10 @@ def test_a_clear_plan_is_carried_out_clear(controller):
 
 def _as_of(plan, scenario):
     return replace(plan, scenario=scenario)
+
+
+def test_an_insertion_in_open_loop_that_the_guard_holds_ends_as_held(plan):
+    scenario = PERFECT.with_values({"zone": [ball(ahead_of(plan, 20.0))]})
+    insertion = flexneedle.insert(scenario, _as_of(plan, scenario), controller="open-loop", force=True)
+    assert insertion.outcome is Outcome.HELD
+    assert "zone artery" in insertion.reason
