@@ -83,7 +83,7 @@ def _is_clear_of_ends(base: Scenario, zones: list[dict[str, Any]]) -> bool:
 
 
 def _map(base: Scenario, zones: list[dict[str, Any]]) -> ZoneMap:
-    return zones_of(base.with_values({"zone": [{"name": "zone", **zone} for zone in zones]}))
+    return zones_of(base.with_values({"zone": [{"name": str(k), **zone} for k, zone in enumerate(zones)]}))
 
 
 def _draw(rng: np.random.Generator, base: Scenario, space: bool) -> list[dict[str, Any]]:
