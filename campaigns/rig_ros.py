@@ -173,7 +173,7 @@ def stop(how: str, timing: int, out: Path, *, quick: bool) -> Row:
     after = float(np.random.default_rng(seed).uniform(_EARLIEST_S, latest))
     with rig_with("[ros]\narm = true", seed % 1000, out, quick=quick) as (rig, scenario):
         process = insertion(rig.rig, scenario, out, "--seed", str(seed % 1000))
-        _await_line(process, b"nothing moves before an arm")
+        _await_line(process, b"nothing moves before it")
         with Operator() as operator:
             operator.publish("arm true")
             sleep(max(0.0, rig.first_motion(process) + after - monotonic()))
