@@ -75,6 +75,7 @@ def test_twice_the_error_of_the_registration_is_added():
     scenario = in_the_way("phantom").with_values({"image.sd_mm": 0.4})
     plan = flexneedle.plan(scenario)
     known = zones_of(scenario.with_values({"image.sd_mm": 0.0}))
+    assert zones_of(scenario).added - known.added == pytest.approx([0.8])
     assert plan.intrusion_mm == 0.0
     assert known.shape_clearances(plan.shapes).min() >= 2.7
 
