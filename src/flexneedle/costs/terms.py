@@ -36,11 +36,13 @@ Complexes = NDArray[np.complex128]
 _PLAN_PRECISION_MM = 0.1  # miss of a plan above which its square costs more than the miss itself
 ENERGIES = ("end energy", "mean energy", "peak energy")
 """Terms whose weights are per E₁, the energy of all tissue down to the target displaced by 1 mm."""
-_ZONES = {"zones", "compression"}  # terms of zones to avoid
+_ZONES = {"zones", "clearance", "compression"}  # terms of zones to avoid
 SHARE_OF_LIMIT = 0.8
 """Share of a limit of the guard above which a load is charged."""
 _AT_LIMIT = 0.002  # share of a limit
 _COMPRESSION = 0.3  # of tissue, in detours
+LITTLE_CLEARANCE = 0.3
+"""Cost (mm) per mm of clearance that is missing."""
 
 
 def per_energy(weights: Mapping[str, float], scale: float) -> dict[str, float]:
@@ -193,6 +195,13 @@ def intrusion(trajectories: Trajectories, clear: float, soft: float = 0.0) -> Fl
     size = inside.max(axis=1) + 0.1 * inside.mean(axis=1)
     total: Floats = size**2 / np.maximum(size + soft, np.finfo(float).tiny) + 1.5 * touched.max(axis=1)
     return total
+
+
+@cost_term("mm", outputs=("clearance",), plan=Weight("clearance", default=LITTLE_CLEARANCE))
+def little_clearance(trajectories: Trajectories, wanted: float) -> Floats:
+    """Return by how much the clearance is less than `wanted` (mm): room for the corrections in an insertion."""
+    missing: Floats = np.maximum(wanted - trajectories.clearance.min(axis=1), 0.0)
+    return missing
 
 
 @cost_term("1", outputs=("stretch",), plan=Weight("compression", default=100.0))

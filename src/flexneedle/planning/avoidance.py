@@ -12,6 +12,7 @@ from flexneedle.planning.freedom import find_freedom
 from flexneedle.planning.horizon import OnIteration, count_iterations, search_settings
 from flexneedle.planning.primitives import Solution
 from flexneedle.planning.problem import PlanProblem
+from flexneedle.planning.steering import inner_reach
 from flexneedle.planning.ways import Room
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
@@ -23,9 +24,10 @@ from flexneedle.types import Floats
 PRECISE_MM = 0.1
 """Miss of a plan above which other searches are made."""
 _RESERVE_MM = 0.1  # of clearance in a search, beyond the margin
+_SPARE = 0.5  # of the margin, which is preferred beyond it
 _SKETCHED = 10  # iterations of a sketch after the race
-_REPEATS = 2  # of a search with more clearance, where the exact rod enters a margin
-_MENDED_MM = 1.5  # largest intrusion for which it is repeated
+_REPEATS = 2  # of a search, with more clearance where the exact rod enters a margin
+_MENDED_MM = 1.5  # largest intrusion and miss for which it is repeated
 _CLEAR_MM = 5.0  # cost of the margins of a plan that nearly keeps them by the simulator
 _NEARLY_MM = 1.5  # of intrusion and miss, for which a last search with more samples is made
 _MORE = 3
@@ -52,16 +54,18 @@ def avoid_zones(
             new = tries.add(
                 carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution
             )
-            near = 0.0 < new.intrusion_mm <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
-            if repeat == _REPEATS or not near:
+            near = _off(new) <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
+            if tries.found or repeat == _REPEATS or not near:
                 break
-            farther = replace(around, clear=zones.margin + _RESERVE_MM + (1 + repeat) * new.intrusion_mm)
-            solution = refine(rollout, farther, solution, search, rng, progress)
+            clear = zones.margin + _RESERVE_MM + (1 + repeat) * new.intrusion_mm
+            solution = refine(
+                rollout, replace(around, clear=clear, spare=0.0), solution, search, rng, progress
+            )
         if tries.found:
             break
     if not tries.found and tries.solution is not None and _off(tries.best) <= _NEARLY_MM:
         more = replace(search, samples=_MORE * search.samples, elite=_MORE * search.elite)
-        solution = refine(rollout, around, tries.solution, more, rng, progress)
+        solution = refine(rollout, replace(around, spare=0.0), tries.solution, more, rng, progress)
         tries.add(carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution)
     best = replace(tries.best, history=tries.history, iterations=len(tries.history))
     if best.hit or best.limit.startswith("guard."):
@@ -88,8 +92,8 @@ class _Tries:
 
     @property
     def found(self) -> bool:
-        """Whether the best plan keeps all margins and reaches its target."""
-        return self.best.hit
+        """Whether the best plan keeps all margins and reaches its target precisely."""
+        return self.best.hit and self.best.error_mm <= PRECISE_MM
 
 
 def sketch_detour(
@@ -110,8 +114,11 @@ def sketch_detour(
 
 def _go_around(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> PlanProblem:
     """Return the problem with zones."""
-    length = simulator.scenario.needle.length_mm
-    return replace(problem, clear=zones.margin + _RESERVE_MM, length=length)
+    length, spare = simulator.scenario.needle.length_mm, _SPARE * zones.margin
+    problem = replace(problem, clear=zones.margin + _RESERVE_MM, spare=spare, length=length)
+    if not problem.entry_coordinates:
+        return problem
+    return replace(problem, inner=inner_reach(make_rollout(simulator, ()), problem))
 
 
 def _search_settings(simulator: Simulator) -> Search:

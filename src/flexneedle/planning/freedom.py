@@ -6,7 +6,7 @@ import numpy as np
 
 from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.problem import PlanProblem
-from flexneedle.planning.ways import Responses, Room, Ways, rate
+from flexneedle.planning.ways import Responses, Room, Ways, measure_gaps, rate_lack
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
 from flexneedle.types import Floats
 
@@ -25,7 +25,8 @@ def find_freedom(rollout: RolloutFunction, problem: PlanProblem, room: Room, lea
     near = np.abs(entries.point) <= max(_RADIUS_MM, problem.entry[0])
     point, slope = entries.point[near], entries.slope[near]
     ways = responses.enter(entries.pattern[near], point, slope)
-    clear = rate(problem, ways, room) <= _CLEAR_MM
+    gaps = measure_gaps(ways, room)
+    clear = rate_lack(problem, ways, room, gaps) <= _CLEAR_MM
     radius, angle = problem.entry
     off, turn = np.abs(point), np.abs(slope)
     found = [
@@ -39,18 +40,20 @@ def find_freedom(rollout: RolloutFunction, problem: PlanProblem, room: Room, lea
             _least("entry.free_slope_mrad", 1e3 * turn[[best]]),
         )
         found = [" with ".join(both)]
-    found.append(
-        _smaller_margin(problem, ways.take(np.flatnonzero((off <= radius) & (turn <= angle))), room, least)
-    )
+    free = np.flatnonzero((off <= radius) & (turn <= angle))
+    found.append(_smaller_margin(problem, ways.take(free), room, gaps[:, free], least))
     return " or ".join(filter(None, found))
 
 
-def _smaller_margin(problem: PlanProblem, ways: Ways, room: Room, least: float) -> str:
-    """Return the largest of some smaller margins with which one of the ways is clear; "" if none is."""
+def _smaller_margin(problem: PlanProblem, ways: Ways, room: Room, gaps: Floats, least: float) -> str:
+    """Return the largest of some smaller margins with which one of the ways is clear; "" if none is.
+
+    gaps (2, N, p): their clearances (mm).
+    """
     if problem.clear is None or not len(ways.z):
         return ""
     for margin in np.arange(problem.clear - _FINE_MM, least - 1e-9, -_FINE_MM).round(1).tolist():
-        if rate(replace(problem, clear=margin), ways, room).min() <= _CLEAR_MM:
+        if rate_lack(replace(problem, clear=margin), ways, room, gaps).min() <= _CLEAR_MM:
             return f"a margin of {margin:g} mm"
     return ""
 

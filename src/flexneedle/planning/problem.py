@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.costs.terms import PLAN, drop_zones, per_energy
-from flexneedle.costs.weighted_sum import Term
+from flexneedle.costs.weighted_sum import Term, Trajectories
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.excess import NO_LIMITS, LoadLimits
-from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, Floats, Point
+from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, Floats, Laterals, Point, across
 
 ADVANCE, LATERAL = range(2)
 """Coordinates of a primitive: the longest step, then `MOVES`, ε on each axis, and the share."""
@@ -21,6 +21,22 @@ ROUNDING = 1e-10
 """Rounding of a length (mm), or relative to it."""
 _ACROSS = 0.1  # share of a standard deviation across the direction of the target
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
+
+
+@dataclass(frozen=True)
+class InnerReach:
+    """Ends of the tip that the bevel reaches with a reserve to all sides: offsets y + iz (mm) from the needle's axis.
+
+    At the end of its reach the bevel could correct no error to one side.
+    """
+
+    middle: float = 0.0
+    half: float = np.inf  # mm to each side
+
+    def beyond(self, off: Laterals) -> Floats:
+        """Return the distances (N,), mm, of offsets (N,) from these ends."""
+        outside: Floats = np.maximum(np.abs(off - self.middle) - self.half, 0.0)
+        return outside
 
 
 @dataclass(frozen=True)
@@ -52,6 +68,8 @@ class PlanProblem:
     loads: LoadLimits = NO_LIMITS  # limits of the guard
     # clearance (mm) from zones below which they are charged, and the compression of the tissue, too; None: neither
     clear: float | None = None
+    spare: float = 0.0  # clearance (mm) beyond it that is preferred
+    inner: InnerReach = InnerReach()  # in which the target should be, from a free entry
     # length of the needle (mm), whose slope shortens it along x; 0: neglected
     length: float = 0.0
 
@@ -63,10 +81,22 @@ class PlanProblem:
         weights["deflection"] /= depth
         weights["guide"] *= depth
         weights["guide force"] = weights["limits"]
-        values = {**loads.values, "clear": 0.0 if self.clear is None else self.clear}
+        clear = 0.0 if self.clear is None else self.clear
+        values = {**loads.values, "clear": clear, "wanted": clear + self.spare}
         terms = PLAN.terms(self.settings, weights, target=self.target, first=1, **values)
         terms = tuple(term for term in terms if term.name != "guide force" or np.isfinite(loads.force))
-        return drop_zones(terms) if self.clear is None else terms
+        terms = drop_zones(terms) if self.clear is None else terms
+        return (*terms, Term("reserve", 1.0, self._beyond_reach)) if np.isfinite(self.inner.half) else terms
+
+    def _beyond_reach(self, trajectories: Trajectories) -> Floats:
+        """Return the distance (mm) of the target from the inner reach of the bevel, from the entry of each sequence."""
+        first, base = trajectories.controls[:, 0], self.mounts[0]
+        slope = across(first, DB_THETA)
+        return self.beyond_reach(across(first, DB_Y) - slope * base, slope)
+
+    def beyond_reach(self, point: Laterals, slope: Laterals) -> Floats:
+        """Return the distances (N,), mm, of the target from the inner reach, from changed entries (mm and slope)."""
+        return self.inner.beyond(self.across - point - slope * self.target[0])
 
     @property
     def entry_coordinates(self) -> int:

@@ -15,14 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from flexneedle.costs.terms import past_target
-from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories
+from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.entry import entry_bounds, mount_needle, read_entry
 from flexneedle.planning.horizon import Found, OnIteration, Variables, count_iterations, find_best
 from flexneedle.planning.primitives import Solution, drop_small_rolls, make_solution
-from flexneedle.planning.problem import PlanProblem
+from flexneedle.planning.problem import InnerReach, PlanProblem
 from flexneedle.simulator.control import controls
-from flexneedle.types import DB_THETA, DB_Y, ROLL, Floats, X, across
+from flexneedle.types import ROLL, Floats, X
 
 MOST_ROLLS = 4
 _INNER = 0.5  # of the reach
@@ -47,7 +47,9 @@ def search_rolls(
     side.
     """
     found: list[tuple[float, int, Found]] = []
-    charged = (*problem.terms, *_margin(rollout, problem))
+    if problem.entry_coordinates:
+        problem = replace(problem, inner=inner_reach(rollout, problem))
+    charged = problem.terms
     size = radius(rollout, problem) if problem.narrow else 0.0
     for rolls in range(most + 1):
         before = min((one.cost for *_, one in found), default=np.inf)
@@ -76,31 +78,13 @@ def search_rolls(
     return make_solution(longer, find_best(variables, rollout, charged, search, rng, progress=shown))
 
 
-def _margin(rollout: RolloutFunction, problem: PlanProblem) -> tuple[Term, ...]:
-    """Return the term of a free entry: distance (mm) of the target from the inner half of the bevel's reach, as a miss.
-
-    At the end of its reach the bevel could correct no error to one side. Where the range is less than a turn, the
-    largest disc in the reach is halved.
-    """
-    if not problem.entry_coordinates:
-        return ()
-    middle = 0.0
+def inner_reach(rollout: RolloutFunction, problem: PlanProblem) -> InnerReach:
+    """Return the inner half of the bevel's reach, or of the largest disc in it where the range is less than a turn."""
     if problem.narrow:
         size, least = radius(rollout, problem), np.cos(problem.rotation)
-        middle, half = 0.5 * size * (1.0 + least), _INNER * 0.5 * size * (1.0 - least)
-    else:
-        least, greatest = _ends(rollout, problem)
-        half = _INNER * 0.5 * (greatest - least)
-
-    def beyond(trajectories: Trajectories) -> Floats:
-        first, base = trajectories.controls[:, 0], problem.mounts[0]
-        slope = across(first, DB_THETA)
-        point = across(first, DB_Y) - slope * base
-        off = complex(*problem.target[1:]) - problem.axis - point - slope * problem.target[0]
-        outside: Floats = np.maximum(np.abs(off - middle) - half, 0.0)
-        return outside
-
-    return (Term("margin", 1.0, beyond),)
+        return InnerReach(0.5 * size * (1.0 + least), _INNER * 0.5 * size * (1.0 - least))
+    least, greatest = _ends(rollout, problem)
+    return InnerReach(half=_INNER * 0.5 * (greatest - least))
 
 
 def _variables(problem: PlanProblem, side: float, rolls: int, mean: Floats, sigma: float) -> Variables:

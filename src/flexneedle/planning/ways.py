@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.costs.terms import SHARE_OF_LIMIT
+from flexneedle.costs.terms import LITTLE_CLEARANCE, SHARE_OF_LIMIT
 from flexneedle.costs.weighted_sum import RolloutFunction
-from flexneedle.planning.entry import entry_bounds
+from flexneedle.planning.entry import entry_bounds, read_entry
 from flexneedle.planning.primitives import make_controls, variables_of
 from flexneedle.planning.problem import LATERAL, PlanProblem
 from flexneedle.types import PSI, THETA, Floats, Laterals, X, Y, across
@@ -91,25 +91,34 @@ def find_ways(
 
 
 def rate(problem: PlanProblem, ways: Ways, room: Room) -> Floats:
-    """Return costs (N,), mm: intrusion into margins, miss, loads of tissue and needle."""
-    inside = np.stack(
-        [_intrusion(problem, ways.depths, each, room) for each in (ways.paths, ways.bodies)]
-    ).max(axis=0)
+    """Return costs (N,), mm: of what the ways lack, of little clearance and of little reserve of the bevel."""
+    gaps = measure_gaps(ways, room)
+    wanted = (problem.clear or 0.0) + problem.spare
+    costs = rate_lack(problem, ways, room, gaps)
+    costs += LITTLE_CLEARANCE * np.maximum(wanted - gaps.min(axis=(0, 2)), 0.0)
+    if problem.entry_coordinates:
+        costs += problem.beyond_reach(*read_entry(problem, ways.z[:, -problem.entry_coordinates :]))
+    return costs
+
+
+def rate_lack(problem: PlanProblem, ways: Ways, room: Room, gaps: Floats) -> Floats:
+    """Return intrusion into margins, miss, loads of tissue and needle (N,), as mm, at clearances (2, N, p)."""
+    inside = np.maximum((problem.clear or 0.0) - gaps, 0.0)
+    worst = (inside.max(axis=2) + _MEAN * inside.mean(axis=2)).max(axis=0)
     miss = np.abs(ways.paths[:, -1] - complex(*problem.target[1:]))
     pressed = np.abs(ways.bodies - ways.paths) / room.lengths(ways.depths)
     excess = np.maximum(pressed.max(axis=1) - _COMPRESSION, 0.0)
     bent = np.abs(ways.bends).max(axis=1) / room.curvature
     excess += np.maximum(bent / SHARE_OF_LIMIT - 1.0, 0.0)
-    costs: Floats = inside + 0.5 * miss + _LOAD_MM * excess + 0.1 * (pressed.max(axis=1) + bent)
+    costs: Floats = worst + 0.5 * miss + _LOAD_MM * excess + 0.1 * (pressed.max(axis=1) + bent)
     return costs
 
 
-def _intrusion(problem: PlanProblem, depths: Floats, lines: Laterals, room: Room) -> Floats:
-    """Return the largest intrusion (N,), mm, of lines (N, p) into margins, and some of its mean."""
-    points = np.stack([np.broadcast_to(depths, lines.shape), lines.real, lines.imag], axis=-1)
-    inside = np.maximum((problem.clear or 0.0) - room.clearances(points), 0.0)
-    found: Floats = inside.max(axis=1) + _MEAN * inside.mean(axis=1)
-    return found
+def measure_gaps(ways: Ways, room: Room) -> Floats:
+    """Return the clearances (2, N, p), mm, of the path of the tip and of the needle at the end."""
+    lines = np.stack([ways.paths, ways.bodies])
+    points = np.stack([np.broadcast_to(ways.depths, lines.shape), lines.real, lines.imag], axis=-1)
+    return room.clearances(points)
 
 
 def _choose(rated: list[tuple[Ways, Floats]], count: int) -> Floats:
