@@ -19,7 +19,7 @@ from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.entry import entry_bounds, read_entry
 from flexneedle.planning.primitives import make_controls, variables_of
 from flexneedle.planning.problem import LATERAL, PlanProblem
-from flexneedle.types import PSI, THETA, Floats, Laterals, X, Y, across
+from flexneedle.types import PSI, THETA, Floats, Laterals, X, Y, Z, across
 
 _PLACES = 6  # at which the bevel may be rolled in a pattern, and one more
 _MOST_ROLLS = 2
@@ -116,8 +116,10 @@ def rate_lack(problem: PlanProblem, ways: Ways, room: Room, gaps: Floats) -> Flo
 
 def measure_gaps(ways: Ways, room: Room) -> Floats:
     """Return the clearances (2, N, p), mm, of the path of the tip and of the needle at the end."""
-    lines = np.stack([ways.paths, ways.bodies])
-    points = np.stack([np.broadcast_to(ways.depths, lines.shape), lines.real, lines.imag], axis=-1)
+    points = np.empty((2, *ways.paths.shape, 3))
+    points[..., X] = ways.depths
+    for k, lines in enumerate((ways.paths, ways.bodies)):
+        points[k, ..., Y], points[k, ..., Z] = lines.real, lines.imag
     return room.clearances(points)
 
 
