@@ -156,7 +156,7 @@ plan-reach: setup  ## plans of 200 random worlds, and what a search of 20 times 
 
 rooms: setup  ## plans and insertions in random rooms with zones to avoid, and forced faults (hours)
 	$(BIN)/python studies/zone_rooms.py plans --larger 20 $(call quick,--count 1 --larger 1)
-	$(BIN)/python studies/zone_rooms.py loops --count 250 $(call quick,--count 1)
+	$(BIN)/python studies/zone_rooms.py loops --count 250 --draws 3 $(call quick,--count 1)
 	$(BIN)/python studies/zone_rooms.py loops --count 25 --sd 0 --displaced 3 --blind $(call quick,--count 1)
 
 tilted-skin: setup  ## insertions where skin and layers are deeper or shallower than planned, as by a tilted skin

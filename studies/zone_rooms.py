@@ -1,7 +1,7 @@
 """Random rooms: worlds with zones to avoid, in the plane and in space.
 
     python studies/zone_rooms.py plans [--first N] [--count N] [--larger FACTOR] [--jobs N] [--out FILE]
-    python studies/zone_rooms.py loops [--first N] [--count N] [--sd MM] [--displaced MM] [--blind] [--out FILE]
+    python studies/zone_rooms.py loops [--first N] [--count N] [--draws N] [--sd MM] [--displaced MM] [--blind]
 
 A room is a wide world with about 1 to 6 zones beside the line from the entry to the target: spheres, capsules, boxes,
 curved vessels (of capsules) and walls with a gap. None has, with its margin, the target or the fixed entry in it. Each
@@ -12,7 +12,8 @@ that without zones (CPU); clearances of the exact plant without mismatch, every 
 
 loops: insertions of clear plans into the exact plant with the mismatch that ships, zones displaced by a normal
 registration error with the standard deviation MM on each axis, of which the scenario knows (`image.sd_mm`), compared
-with insertions without zones, from the entry of a plan without zones and from the entry of the plan with zones.
+with insertions without zones, from the entry of a plan without zones; --draws: insertions of each plan, each into
+another plant with another error.
 --displaced: by this distance in the worst of 12 directions, which the scenario does not know; --blind: a controller
 without the terms of zones.
 
@@ -22,6 +23,7 @@ Rooms below 1000 are for tuning, those from 100,000 on for reports.
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -37,6 +39,7 @@ import numpy as np
 import flexneedle
 from flexneedle import Plan, Scenario
 from flexneedle.phantom.draw import draw
+from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.phantom.plants import ExactPlant
 from flexneedle.scenario.worlds import PLANE, WIDE, has_rig, world
 from flexneedle.simulator.zones import ZoneMap, zones_of
@@ -50,6 +53,7 @@ _ERROR_MM = 0.5  # of a plan that counts as found
 _SUBSTEPS = 4  # of a step of 1 mm in the independent check
 _DIRECTIONS = 12
 _MARGIN_MM = 2.0
+_SEEDS = 1_000_000  # beyond the number of any room
 _REFUTED_MM = 0.0
 _PLACES = ("center_mm", "from_mm", "to_mm", "point_mm")
 _Make = Callable[[Any], list[dict[str, Any]]]
@@ -202,12 +206,13 @@ def exact_clearance(scenario: Scenario, plan: Plan) -> float:
     return least
 
 
-def plan_room(job: tuple[int, bool, bool], larger: int) -> dict[str, Any]:
+def plan_room(job: tuple[int, bool, bool], larger: int) -> list[dict[str, Any]]:
     """Return the row of a room."""
     number, free, space = job
     scenario = room(number, free=free, space=space, case="perfect")
     without = scenario.with_values({"zone": []})
-    flexneedle.plan(without, threads=1)  # compiled, in the cache
+    compile_kernels(2 if space else 1)
+    flexneedle.plan(without, threads=1)  # in the cache
     begun = time.process_time()
     plain = flexneedle.plan(without, threads=1)
     between = time.process_time()
@@ -227,7 +232,7 @@ def plan_room(job: tuple[int, bool, bool], larger: int) -> dict[str, Any]:
             scenario.with_values({"plan.samples": larger * scenario.plan.samples}), threads=1
         )
         row["larger"] = is_found(searched)
-    return row
+    return [row]
 
 
 def print_plans(rows: list[dict[str, Any]]) -> None:
@@ -240,102 +245,13 @@ def print_plans(rows: list[dict[str, Any]]) -> None:
         own = [row for row in rows if row["free"] == free]
         of = [row["found"] for row in own if row.get("larger")]
         refuted = [row["room"] for row in own if row["exact"] is not None and row["exact"] < -_REFUTED_MM]
-        print(
-            f"|{'free' if free else 'fixed'}|{len(own)}|{sum(row['touched'] for row in own)}"
-            f"|{sum(row['found'] for row in own)}|{sum(of)} of {len(of)}|{refuted or 'none'}|"
-        )
-    ratios, seconds = (np.array([row[key] for row in rows]) for key in ("ratio", "seconds"))
-    changed = np.array([not row["same"] for row in rows])
-    print(
-        f"time over that without zones: median {np.median(ratios):.2f}, of changed plans "
-        f"{np.median(ratios[changed]):.2f}; longest {seconds.max():.1f} s"
-    )
-
-
-# ---- insertions
-
-
-def displace(scenario: Scenario, shift: Any) -> Scenario:
-    """Return the scenario with its zones where they are, displaced by a vector (3,), and known."""
-    zones = [
-        {key: np.add(value, shift).tolist() if key in _PLACES else value for key, value in zone.items()}
-        for zone in scenario.values()["zone"]
-    ]
-    return scenario.with_values({"zone": zones, "image.sd_mm": 0.0})
-
-
-def insert_room(
-    job: tuple[int, bool, bool], sd: float, displaced: float, blind: bool
-) -> dict[str, Any] | None:
-    """Return the row of an insertion with zones and one without; None without a plan that is found."""
-    number, free, space = job
-    scenario = room(number, free=free, space=space).with_values({"image.sd_mm": sd})
-    plan = flexneedle.plan(scenario, threads=1)
-    if not is_found(plan):
-        return None
-    rng = np.random.default_rng([20261130, number])
-    shift = rng.normal(0.0, sd, 3) * [1.0, 1.0, float(space)]
-    if displaced:
-        shift = _worst_shift(scenario, plan, displaced, space)
-    there = displace(scenario, shift)
-    used = there if displaced else scenario
-    if blind:
-        used = used.with_values({"control.adaptive_mpc.zone_weight": 0.0})
-    plan = _of(plan, used)
-    done, true = flexneedle.insert(used, plan, seed=number, threads=1, force=bool(displaced)), zones_of(there)
-    without, there_too = (each.with_values({"zone": []}) for each in (scenario, plan.scenario))
-    plain, same = (
-        flexneedle.insert(each, flexneedle.plan(each, threads=1), seed=number, threads=1)
-        for each in (without, there_too)
-    )
-    least = min(
-        (true.clearances(p.true_shape).min() for p in done.periods if p.true_shape is not None),
-        default=np.inf,
-    )
-    return {
-        "room": number, "free": free, "space": space, "clearance": float(least + true.added.max()),
-        "estimated": min(p.clearance for p in done.periods), "planned": plan.least_clearance_mm,
-        "outcome": str(done.outcome), "reason": done.reason, "error": done.true_error_mm,
-        "plan_error": plan.error_mm, "outcome_without": str(plain.outcome), "error_without": plain.true_error_mm,
-        "outcome_same": str(same.outcome), "error_same": same.true_error_mm,
-    }  # fmt: skip
-
-
-def _of(plan: Plan, scenario: Scenario) -> Plan:
-    """Return a plan as one of a scenario that differs in its zones alone, with the plan's entry."""
-    made = plan.scenario
-    entry = {f"entry.{key}": value for key, value in made.entry.model_dump().items()}
-    return replace(plan, scenario=scenario.with_values(entry))
-
-
-def _worst_shift(scenario: Scenario, plan: Plan, size: float, space: bool) -> Any:
-    """Return the displacement (3,) of this size, of some across the needle, after which a plan is nearest."""
-    angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False) if space else np.array([0.0, np.pi])
-    shifts = size * np.stack([np.zeros_like(angles), np.cos(angles), np.sin(angles) * space], axis=1)
-    least = [zones_of(displace(scenario, each)).clearances(plan.shapes[..., :3]).min() for each in shifts]
-    return shifts[int(np.argmin(least))]
-
-
-def print_loops(rows: list[dict[str, Any]]) -> None:
-    """Print a line for free and fixed entries."""
-    print(
-        "|entry|insertions|touched|margin entered by > 0.1 mm|held|held without zones"
-        "|mean error|without zones|… from the same entry|"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
-    for free in (True, False):
-        own = [row for row in rows if row["free"] == free]
-        outcomes, errors = (
-            [f"{name}{case}" for case in ("", "_without", "_same")] for name in ("outcome", "error")
-        )
-        done = [row for row in own if all(row[key] == "done" for key in outcomes)]
-        held, held_without = (sum(row[key] != "done" for row in own) for key in outcomes[:2])
-        means = [np.mean([row[key] for row in done]) if done else np.nan for key in errors]
-        print(
-            f"|{'free' if free else 'fixed'}|{len(own)}|{sum(row['clearance'] < 0.0 for row in own)}"
-            f"|{sum(row['clearance'] < _MARGIN_MM - 0.1 for row in own)}|{held}|{held_without}"
-            f"|{' mm|'.join(f'{mean:.4f}' for mean in means)} mm|"
-        )
+        counts = [
+            len({(row["room"], row["space"]) for row in own}), len(own),
+            sum(row["clearance"] < 0.0 for row in own), sum(row["clearance"] < _MARGIN_MM - 0.1 for row in own),
+            held, held_without,
+        ]  # fmt: skip
+        cells = [str(count) for count in counts] + [f"{mean:.4f} mm" for mean in means]
+        print(f"|{'free' if free else 'fixed'}|{'|'.join(cells)}|")
 
 
 def main() -> None:
@@ -347,6 +263,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=100_000)
     parser.add_argument("--count", type=int, default=25)
     parser.add_argument("--larger", type=int, default=1)
+    parser.add_argument("--draws", type=int, default=1)
     parser.add_argument("--sd", type=float, default=0.5)
     parser.add_argument("--displaced", type=float, default=0.0)
     parser.add_argument("--blind", action="store_true")
@@ -356,15 +273,17 @@ def main() -> None:
     work = (
         partial(plan_room, larger=given.larger)
         if given.what == "plans"
-        else partial(insert_room, sd=given.sd, displaced=given.displaced, blind=given.blind)
+        else partial(
+            insert_room, sd=given.sd, displaced=given.displaced, blind=given.blind, draws=given.draws
+        )
     )
-    rows = []
+    rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(work, kinds(given.first, given.count)):
-            if row is not None:
-                rows.append(row)
-                if given.out:
-                    given.out.write_text("".join(json.dumps(each) + "\n" for each in rows))
+        for number, found in enumerate(pool.map(work, jobs := kinds(given.first, given.count)), 1):
+            rows += found
+            print(f"\r{number} of {len(jobs)} rooms", end="", file=sys.stderr)
+            if given.out:
+                given.out.write_text("".join(json.dumps(each) + "\n" for each in rows))
     (print_plans if given.what == "plans" else print_loops)(rows)
 
 

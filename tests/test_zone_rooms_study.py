@@ -19,14 +19,14 @@ def test_rooms_are_the_same_for_a_number_and_leave_target_and_entry_free(space):
 
 
 def test_a_row_of_a_plan_has_times_and_the_clearance_of_the_exact_rod():
-    row = zone_rooms.plan_room((5, True, False), larger=1)
+    (row,) = zone_rooms.plan_room((5, True, False), larger=1)
     assert row["found"]
     assert row["exact"] >= 0.0
     assert row["ratio"] > 1.0
 
 
 def test_a_zone_that_is_displaced_towards_the_needle_is_not_touched_without_terms_of_zones():
-    row = zone_rooms.insert_room((5, True, False), sd=0.0, displaced=6.0, blind=True)
+    (row,) = zone_rooms.insert_room((5, True, False), sd=0.0, displaced=6.0, blind=True, draws=1)
     assert row["outcome"] == "held"
     assert row["clearance"] > 0.3
 
