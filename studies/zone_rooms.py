@@ -245,6 +245,96 @@ def print_plans(rows: list[dict[str, Any]]) -> None:
         own = [row for row in rows if row["free"] == free]
         of = [row["found"] for row in own if row.get("larger")]
         refuted = [row["room"] for row in own if row["exact"] is not None and row["exact"] < -_REFUTED_MM]
+        print(
+            f"|{'free' if free else 'fixed'}|{len(own)}|{sum(row['touched'] for row in own)}"
+            f"|{sum(row['found'] for row in own)}|{sum(of)} of {len(of)}|{refuted or 'none'}|"
+        )
+    ratios, seconds = (np.array([row[key] for row in rows]) for key in ("ratio", "seconds"))
+    changed = np.array([not row["same"] for row in rows])
+    print(
+        f"time over that without zones: median {np.median(ratios):.2f}, of changed plans "
+        f"{np.median(ratios[changed]):.2f}; longest {seconds.max():.1f} s"
+    )
+
+
+# ---- insertions
+
+
+def displace(scenario: Scenario, shift: Any) -> Scenario:
+    """Return the scenario with its zones where they are, displaced by a vector (3,), and known."""
+    zones = [
+        {key: np.add(value, shift).tolist() if key in _PLACES else value for key, value in zone.items()}
+        for zone in scenario.values()["zone"]
+    ]
+    return scenario.with_values({"zone": zones, "image.sd_mm": 0.0})
+
+
+def insert_room(
+    job: tuple[int, bool, bool], sd: float, displaced: float, blind: bool, draws: int
+) -> list[dict[str, Any]]:
+    """Return the rows of insertions with zones and without; none without a plan that is found."""
+    number, free, space = job
+    scenario = room(number, free=free, space=space).with_values({"image.sd_mm": sd})
+    plan = flexneedle.plan(scenario, threads=1)
+    if not is_found(plan):
+        return []
+    without = scenario.with_values({"zone": []})
+    plain = flexneedle.plan(without, threads=1)
+    rows = []
+    for draw_number in range(draws):
+        seed = number + _SEEDS * draw_number
+        shift = np.random.default_rng([20261130, seed]).normal(0.0, sd, 3) * [1.0, 1.0, float(space)]
+        if displaced:
+            shift = _worst_shift(scenario, plan, displaced, space)
+        there = displace(scenario, shift)
+        used = there if displaced else scenario
+        if blind:
+            used = used.with_values({"control.adaptive_mpc.zone_weight": 0.0})
+        done = flexneedle.insert(used, _of(plan, used), seed=seed, threads=1, force=bool(displaced))
+        other = flexneedle.insert(without, plain, seed=seed, threads=1)
+        true = zones_of(there)
+        least = min(
+            (true.clearances(p.true_shape).min() for p in done.periods if p.true_shape is not None),
+            default=np.inf,
+        )
+        rows.append({
+            "room": number, "free": free, "space": space, "draw": draw_number,
+            "clearance": float(least + true.added.max()), "estimated": min(p.clearance for p in done.periods),
+            "planned": plan.least_clearance_mm, "plan_error": plan.error_mm,
+            "outcome": str(done.outcome), "reason": done.reason, "error": done.true_error_mm,
+            "outcome_without": str(other.outcome), "error_without": other.true_error_mm,
+        })  # fmt: skip
+    return rows
+
+
+def _of(plan: Plan, scenario: Scenario) -> Plan:
+    """Return a plan as one of a scenario that differs in its zones alone, with the plan's entry."""
+    made = plan.scenario
+    entry = {f"entry.{key}": value for key, value in made.entry.model_dump().items()}
+    return replace(plan, scenario=scenario.with_values(entry))
+
+
+def _worst_shift(scenario: Scenario, plan: Plan, size: float, space: bool) -> Any:
+    """Return the displacement (3,) of this size, of some across the needle, after which a plan is nearest."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False) if space else np.array([0.0, np.pi])
+    shifts = size * np.stack([np.zeros_like(angles), np.cos(angles), np.sin(angles) * space], axis=1)
+    least = [zones_of(displace(scenario, each)).clearances(plan.shapes[..., :3]).min() for each in shifts]
+    return shifts[int(np.argmin(least))]
+
+
+def print_loops(rows: list[dict[str, Any]]) -> None:
+    """Print a line for free and fixed entries."""
+    print(
+        "|entry|plans|insertions|touched|margin entered by > 0.1 mm|held|held without zones"
+        "|mean error|without zones|"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for free in (True, False):
+        own = [row for row in rows if row["free"] == free]
+        outcomes, errors = ([f"{name}{case}" for case in ("", "_without")] for name in ("outcome", "error"))
+        done = [row for row in own if all(row[key] == "done" for key in outcomes)]
+        held, held_without = (sum(row[key] != "done" for row in own) for key in outcomes)
+        means = [np.mean([row[key] for row in done]) if done else np.nan for key in errors]
         counts = [
             len({(row["room"], row["space"]) for row in own}), len(own),
             sum(row["clearance"] < 0.0 for row in own), sum(row["clearance"] < _MARGIN_MM - 0.1 for row in own),
