@@ -27,9 +27,10 @@ _RESERVE_MM = 0.1  # of clearance in a search, beyond the margin
 _SPARE = 0.5  # of the margin, which is preferred beyond it
 _SKETCHED = 10  # iterations of a sketch after the race
 _REPEATS = 2  # of a search, with more clearance where the exact rod enters a margin
-_MENDED_MM = 1.5  # largest intrusion and miss for which it is repeated
+_MENDED_MM = 1.0  # largest intrusion and miss for which it is repeated,
+_MENDED = 0.8  # and share of those before
 _CLEAR_MM = 5.0  # cost of the margins of a plan that nearly keeps them by the simulator
-_NEARLY_MM = 1.5  # of intrusion and miss, for which a last search with more samples is made
+_NEARLY_MM = 0.5  # of intrusion and miss, for which a last search with more samples is made
 _MORE = 3
 _OVERLOAD_MM = 10.0  # rank of a load beyond a limit of the guard
 
@@ -50,22 +51,24 @@ def avoid_zones(
     solutions = search_detours(rollout, shapes_of, around, room, search, rng, after)
     tries = _Tries(found)
     for solution in solutions:
+        clear, before = zones.margin + _RESERVE_MM, np.inf
         for repeat in range(1 + _REPEATS):
             new = tries.add(
                 carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution
             )
-            near = _off(new) <= _MENDED_MM and solution.terms["zones"] <= _CLEAR_MM
+            near = _off(new) <= min(_MENDED_MM, before) and solution.terms["zones"] <= _CLEAR_MM
             if tries.found or repeat == _REPEATS or not near:
                 break
-            clear = zones.margin + _RESERVE_MM + (1 + repeat) * new.intrusion_mm
-            solution = refine(
-                rollout, replace(around, clear=clear, spare=0.0), solution, search, rng, progress
-            )
+            clear, before = clear + (1 + repeat) * new.intrusion_mm, _MENDED * _off(new)
+            farther = replace(around, clear=clear, spare=0.0)
+            solution = refine(rollout, farther, solution, search, rng, progress)
         if tries.found:
             break
     if not tries.found and tries.solution is not None and _off(tries.best) <= _NEARLY_MM:
         more = replace(search, samples=_MORE * search.samples, elite=_MORE * search.elite)
-        solution = refine(rollout, replace(around, spare=0.0), tries.solution, more, rng, progress)
+        clear = zones.margin + _RESERVE_MM + 2.0 * tries.best.intrusion_mm
+        farther = replace(around, clear=clear, spare=0.0)
+        solution = refine(rollout, farther, tries.solution, more, rng, progress)
         tries.add(carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution)
     best = replace(tries.best, history=tries.history, iterations=len(tries.history))
     if best.hit or best.limit.startswith("guard."):
