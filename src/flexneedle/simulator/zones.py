@@ -10,19 +10,17 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.errors import InputError
-from flexneedle.files import digest_of
 from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.rigid import Rigid
 from flexneedle.mechanics import zones as kernels
 from flexneedle.plugins import load_part
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections import zones as sections
+from flexneedle.scenario.zone_files import find_lost, stamp_of
 from flexneedle.simulator.state import State
 from flexneedle.types import Floats
 
@@ -207,19 +205,13 @@ def zones_of(scenario: Scenario) -> ZoneMap:
 
 def zones_of_record(scenario: Scenario) -> ZoneMap:
     """Return the zones of a recorded scenario, for views: those whose file is missing or has changed are `lost`."""
-    lost = {}
-    for number, zone in enumerate(scenario.zone):
-        try:
-            _stamp(zone)
-        except InputError as error:
-            lost[number] = str(error)
-    return _make_zones(scenario, lost)
+    return _make_zones(scenario, find_lost(scenario))
 
 
 def _make_zones(scenario: Scenario, lost: Mapping[int, str]) -> ZoneMap:
     if not scenario.zone:
         return NO_ZONES
-    files = tuple(_stamp(zone) for number, zone in enumerate(scenario.zone) if number not in lost)
+    files = tuple(stamp_of(zone) for number, zone in enumerate(scenario.zone) if number not in lost)
     workspace, spacing = workspace_corners(scenario), scenario.contact.spacing_mm
     return _zones_of(
         scenario.zone,
@@ -288,33 +280,6 @@ def sag(spacing: float, distance: float) -> float:
     """Return by how much the middle of two points may be nearer to a point at this distance from both (mm)."""
     half = min(0.5 * spacing, distance)
     return distance - math.sqrt(distance**2 - half**2)
-
-
-def _stamp(zone: sections.Zone) -> tuple[int, int] | None:
-    """Return time and size of a zone's file, None without one.
-
-    Raises InputError if the file cannot be read, or has changed.
-    """
-    if not isinstance(zone, sections.ZoneFile):
-        return None
-    path = Path(zone.file)
-    try:
-        found = path.stat()
-        stamp = found.st_mtime_ns, found.st_size
-        digest = _digest_of(path, stamp) if zone.sha256 else None
-    except OSError as error:
-        raise InputError(f"zone {zone.name}: {path}: cannot be read: {error.strerror}") from error
-    if digest != zone.sha256:
-        raise InputError(
-            f"zone {zone.name}: {path}: has changed since the scenario was made (sha256 {digest}); "
-            "plan again with the scenario that names it"
-        )
-    return stamp
-
-
-@lru_cache(maxsize=100)
-def _digest_of(path: Path, _stamp: tuple[int, int]) -> str:
-    return digest_of(path)
 
 
 def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:
