@@ -106,7 +106,7 @@ def find_doubts(scenario: Scenario) -> list[str]:
         *_unusual(scenario),
         *_find_unused(scenario),
         *_stale(scenario),
-        *_without_image(scenario),
+        *find_unplaced(scenario),
         *find_lost(scenario).values(),
     ]
 
@@ -144,7 +144,8 @@ def _stale(scenario: Scenario) -> Iterator[str]:
         yield f"phantom.delay_periods = {periods:g}: {rule}: {remedy} (setup.insertion_speed_mm_s is low)"
 
 
-def _without_image(scenario: Scenario) -> Iterator[str]:
+def find_unplaced(scenario: Scenario) -> Iterator[str]:
+    """Yield a line for each zone whose file is in the frame of an unknown image."""
     if scenario.image == ImageSettings():
         for zone in scenario.zone:
             if isinstance(zone, ZoneFile):
