@@ -1,4 +1,6 @@
-"""Terms of zones: slopes of the clearance and rows that lead out of margins in broyden-mpc, the weight in ce-mpc."""
+"""Zones in controllers: slopes of the clearance, rows that lead out of margins, and commands with and without zones."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,3 +54,20 @@ def test_one_decision_of_ce_mpc_leads_away_from_a_zone_beside_the_path(quick_pla
     (guide, clearance), (plain_guide, plain_clearance) = decide(60.0), decide(0.0)
     assert side * (guide - plain_guide) < -0.1
     assert clearance > plain_clearance + 0.1
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS.values(), ids=CONTROLLERS)
+def test_a_command_depends_on_a_zone_ahead_if_the_controller_avoids_zones(quick_plan, along, controller):
+    """The needle is on the planned path, which enters the margin of a sphere."""
+    x, y = quick_plan.tips[45, :2].tolist()
+
+    def decide(*zones):
+        scenario = load_scenario("phantom").with_values({"zone": list(zones)})
+        task = task_of(Simulator(scenario, threads=1), quick_plan, controller.name)
+        state = along(quick_plan, 40, scenario)
+        measured = {"state": state, "measured": tuple(state.tip[:3].tolist())}
+        estimate = replace(controller.observer.begin(task), **measured)
+        return controller.decide(task, controller.begin(task), estimate, np.random.default_rng(0))[0].command
+
+    zone = {**BALL, "center_mm": [x, y + 2.5, 0.0]}
+    assert (decide(zone) != decide()) is controller.avoids_zones
