@@ -119,3 +119,20 @@ def test_a_zone_out_of_reach_is_named_without_a_clearance(in_tmp):
         plan = flexneedle.plan(scenario)
         assert plan.least_clearance_mm == np.inf
         assert plan.refusal == ""
+
+
+@pytest.mark.parametrize(
+    "command", [("plan",), ("plan", "--entries"), ("insert",)], ids=["plan", "entries", "insert"]
+)
+def test_a_file_of_a_zone_without_an_image_is_one_line_as_of_scenario_check(capsys, in_tmp, engine, command):
+    engine()
+    name, *options = command
+    with grid_files(in_tmp) as ring:
+        scenario = with_zones("phantom", ring).with_values(FREE)
+        (in_tmp / "a.toml").write_text(dump_scenario(scenario))
+        (in_tmp / "b.toml").write_text(dump_scenario(scenario.with_values({"image.sd_mm": 0.3})))
+        _, _, checked = run(capsys, "scenario", "check", "a.toml")
+        (_, _, err), (_, _, placed) = (run(capsys, name, each, *options) for each in ("a.toml", "b.toml"))
+    assert "zone ring: file in the image's frame" in checked
+    assert err.count(checked) == 1
+    assert "zone ring" not in placed

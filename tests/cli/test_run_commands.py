@@ -18,6 +18,8 @@ from flexneedle.errors import RunError
 from flexneedle.invasiveness import format_number
 from flexneedle.phantom import kernels
 from flexneedle.record.reader import read_trace
+from flexneedle.scenario.files import dump_scenario
+from zoned import SPHERE, with_zones
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 
@@ -323,3 +325,15 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
         cli.main(argv)
     assert caught.value.code == 2
     assert capsys.readouterr().out == ""
+
+
+def test_a_controller_that_does_not_avoid_zones_is_one_line_if_there_are_zones(engine, capsys, in_tmp):
+    engine()
+    (in_tmp / "zoned.toml").write_text(dump_scenario(with_zones("phantom", SPHERE)))
+
+    def count(scenario, *controller):
+        _, _, err = run(capsys, "insert", scenario, *controller)
+        return err.count("does not avoid zones")
+
+    assert count("zoned.toml", "--controller", "open-loop") == 1
+    assert count("zoned.toml") == count("phantom", "--controller", "open-loop") == 0

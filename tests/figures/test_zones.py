@@ -143,3 +143,16 @@ def test_figures_without_zones_have_no_panel_of_the_clearance():
     with unarranged():
         figure = plan_figure(with_zones("phantom").with_values({"zone": []}), [make_plan()])
     assert "clearance" not in {ax.get_label() for ax in figure.axes}
+
+
+@pytest.mark.parametrize("base", ["phantom", "phantom3d"])
+def test_a_zone_whose_file_is_missing_is_named_in_the_title_and_no_nearest_zone_is_drawn(base):
+    """The recorded clearance may be the lost zone's, so that its line must not end at another zone."""
+    lost = {"name": "ring", "shape": "file", "file": "/nowhere/ring.nrrd", "segment": "ring"}
+    scenario, made = with_zones(base, lost, SPHERE), make_insertion()
+    made = in_space(made, 0.7) if base == "phantom3d" else made
+    with unarranged():
+        for figure in (insertion_figure(scenario, made), plan_figure(scenario, [made.plan])):
+            assert figure.get_suptitle().split()[-1] == "ring"
+            assert "node" in texts(figure)
+            assert not [line for ax in figure.axes for line in lines(ax, "least clearance")]

@@ -216,6 +216,17 @@ def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
     assert [path.name for path in draw_run(folder)] == ["plan.png", "plan.svg"]
 
 
+@pytest.mark.usefixtures("empty_figures")
+def test_a_run_is_drawn_without_the_file_of_a_zone_and_with_a_line_about_it(tmp_path):
+    zone = {"shape": "file", "name": "artery", "file": str(tmp_path / "gone.stl")}
+    scenario = PHANTOM.with_values({"zone": [zone]})
+    folder = flexneedle.save(replace(INSERTION, scenario=scenario), tmp_path / "run")
+    notes = []
+    assert [path.name for path in draw_run(folder, notes.append)] == ["insertion.png", "insertion.svg"]
+    assert len(notes) == 1
+    assert f"zone artery: {zone['file']}: " in notes[0]
+
+
 @pytest.mark.parametrize("record", [PLAN, INSERTION], ids=["plan", "insertion"])
 def test_a_loaded_record_keeps_the_versions_that_made_it(tmp_path, record):
     path = flexneedle.save(record, tmp_path / "old") / "run.json"

@@ -2,11 +2,13 @@
 
 import pytest
 
+from flexneedle.errors import InputError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.library import PRESETS
 from flexneedle.scenario.plausible import USUAL, find_doubts
 from flexneedle.scenario.sections.needle import GAUGES
 from flexneedle.scenario.worlds import PERFECT, STRUCTURE, world
+from flexneedle.simulator.zones import zones_of
 
 PHANTOM = load_scenario("phantom")
 
@@ -57,12 +59,25 @@ def test_readings_that_arrive_stale_are_in_doubt():
     )
 
 
-def test_the_file_of_a_zone_without_an_image_is_in_doubt():
-    zone = {"name": "a", "shape": "file", "file": "a.stl"}
+def test_the_file_of_a_zone_without_an_image_is_in_doubt(tmp_path):
+    (tmp_path / "a.stl").touch()
+    zone = {"name": "a", "shape": "file", "file": str(tmp_path / "a.stl")}
     scenario = PHANTOM.with_values({"zone": [zone]})
     (found,) = find_doubts(scenario)
     assert found.startswith("zone a: file in the image's frame")
     assert find_doubts(scenario.with_values({"image.sd_mm": 0.3})) == []
+
+
+@pytest.mark.parametrize("known", [{}, {"sha256": 64 * "0"}], ids=["missing", "changed"])
+def test_a_file_of_a_zone_that_a_plan_would_refuse_has_the_same_line(tmp_path, known):
+    path = tmp_path / "a.stl"
+    if known:
+        path.touch()
+    zone = {"name": "a", "shape": "file", "file": str(path), **known}
+    scenario = PHANTOM.with_values({"zone": [zone], "image.sd_mm": 0.3})
+    with pytest.raises(InputError) as refused:
+        zones_of(scenario)
+    assert find_doubts(scenario) == [str(refused.value)]
 
 
 def test_every_value_that_is_off_has_its_line():

@@ -1,9 +1,13 @@
 """Clearances of needles from the zones of a scenario, against distances by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from flexneedle.simulator.zones import NO_ZONES, zones_of
+from flexneedle.errors import InputError
+from flexneedle.files import digest_of
+from flexneedle.simulator.zones import NO_ZONES, zones_of, zones_of_record
 from zoned import BOX, SPHERE, grid_files, with_zones
 
 CENTER, RADIUS = np.array(SPHERE["center_mm"]), SPHERE["radius_mm"]
@@ -61,3 +65,24 @@ def test_the_nearest_zone_is_named_with_its_own_margin(tmp_path):
     assert zones.added[1] == pytest.approx(zones.added[0] + 0.1)
     x, y, z = near.surface
     assert np.hypot(np.hypot(y, z) - 6.0, x - 30.0) == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("lose", [lambda path: path.unlink(), lambda path: path.write_text("another")])
+def test_of_a_record_the_zones_whose_file_is_missing_or_has_changed_are_lost_and_the_others_are_not(
+    tmp_path, lose
+):
+    """The nearest zone is unknown then, and a needle that moves needs all zones."""
+    with grid_files(tmp_path) as ring:
+        path = Path(ring["file"])
+        scenario = with_zones("phantom3d", {**ring, "sha256": digest_of(path)}, BOX)
+        assert zones_of_record(scenario) is zones_of(scenario)
+        lose(path)
+        found, points = zones_of_record(scenario), bent(2.5)
+        with pytest.raises(InputError, match="ring"):
+            zones_of(scenario)
+    assert list(found.lost) == [0]
+    assert found.out_of_reach == ()
+    assert (found.distances(points)[0] == np.inf).all()
+    others = zones_of(with_zones("phantom3d", BOX)).distances(points)[0]
+    np.testing.assert_array_equal(found.distances(points)[1], others)
+    assert found.closest(points) is None

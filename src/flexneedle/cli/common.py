@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,10 +107,18 @@ def load_named(args: argparse.Namespace) -> Scenario:
 
 
 def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
-    """Return the scenario with the requested target and all controller settings. Raises ScenarioError."""
-    from flexneedle.control.controllers import with_controller_defaults
+    """Return the scenario with the requested target and all controller settings.
 
-    scenario = with_controller_defaults(args.load(args), *own, source=args.image or args.scenario)
+    Raises ScenarioError. Warns, as `scenario check`, of zones whose place is in doubt.
+    """
+    from flexneedle.control.controllers import with_controller_defaults
+    from flexneedle.errors import ScenarioWarning
+    from flexneedle.scenario.plausible import find_unplaced
+
+    source = args.image or args.scenario
+    scenario = with_controller_defaults(args.load(args), *own, source=source)
+    for line in find_unplaced(scenario):
+        warnings.warn(f"{source}: {line}", ScenarioWarning, stacklevel=2)
     return scenario if args.target is None else with_target(scenario, args.target)
 
 

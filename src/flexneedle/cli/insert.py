@@ -19,6 +19,7 @@ from flexneedle.cli.common import (
     run_name,
 )
 from flexneedle.cli.insertion_report import report
+from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import seed
 from flexneedle.errors import FlexneedleError, StoppedError, one_line
 
@@ -144,6 +145,10 @@ def _insert(args: argparse.Namespace) -> int:
         with _print_refusal(args, choices, scenario):
             check_choices(scenario, args.strategy, choices)
             zones_of(scenario)  # a file that cannot be used leaves no folder
+            if scenario.zone and not choices.controller.avoids_zones:
+                print_note(
+                    f"{choices.controller.name} does not avoid zones: only the guard holds the needle before one"
+                )
             scenario = connection.start(stack, scenario)
             compile_first(scenario.setup.axes)
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)

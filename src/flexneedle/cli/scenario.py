@@ -57,7 +57,7 @@ def _add_check(commands: Commands) -> None:
         "flexneedle scenario check mine.toml --strict",
         "flexneedle scenario check mine.toml --controller follow_path:CONTROLLER",
         about="Check a scenario. Prints one line per problem (exit status 2) and a warning for each unused "
-        "or implausible value (exit status 0).",
+        "or implausible value, and for each file of a zone that cannot be used (exit status 0).",
     )
     parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name, wide:NUMBER or world:NUMBER")
     _add_controller(parser)

@@ -138,6 +138,7 @@ class Controller:
         settings: Class of its settings, with a default for each, in the scenario's table `control.<table>`.
         needs_guide: Whether it is refused if the guide may not move.
         predicts: Whether its decisions predict the miss, so that the loop accepts a plan that misses.
+        avoids_zones: Whether its decisions depend on the zones to avoid; else the guard alone regards them.
 
     Raises:
         InputError: A name or settings that cannot be used.
@@ -153,6 +154,7 @@ class Controller:
     settings: type[Section] | None = None
     needs_guide: bool = False
     predicts: bool = False
+    avoids_zones: bool = False
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(str(self.name)):

@@ -20,9 +20,10 @@ from flexneedle.figures.style import (
     is_column,
     small,
 )
+from flexneedle.figures.zones import name_lost
 from flexneedle.planning.entry_map import EntryMap
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.zones import zones_of
+from flexneedle.simulator.zones import zones_of_record
 from flexneedle.types import Flags, Floats, Y, Z
 
 NUMBERED = 5
@@ -51,7 +52,7 @@ def entries_figure(found: EntryMap) -> Figure:
     scenario, shown = found.scenario, _quantities(found)
     target = ", ".join(format_signed(value) for value in scenario.target.position[: 1 + scenario.setup.axes])
     clear = f"{found.clear.sum()} of {len(found.clear)} entries"
-    title = f"{short(scenario.name, 40)}: clear insertions to ({target}) mm from {clear}"
+    title = f"{short(scenario.name, 40)}: clear insertions to ({target}) mm from {clear}{name_lost(scenario)}"
     with apply_style():
         if scenario.setup.axes == 1:
             names = [name.partition(" ")[0] for name in shown]
@@ -97,7 +98,7 @@ def _draw_curve(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
     values = np.where(quantity.known, quantity.values, np.nan)
     ax.plot(y, values, ".-", color=ESTIMATE, markersize=3, zorder=3)
     if quantity.title.startswith("Clearance"):
-        for margin in sorted(set(zones_of(found.scenario).margins.tolist())):
+        for margin in sorted(set(zones_of_record(found.scenario).margins.tolist())):
             ax.axhline(margin, color=ZONE, linestyle=":", linewidth=1.0, label="margin", zorder=2)
     for number, k in enumerate(found.best(NUMBERED)):
         how: dict[str, Any] = {"linewidth": 0.8, "linestyle": "--", "label": "next entries"}
@@ -150,7 +151,7 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
 def _mark_margins(bar: Axes, scenario: Scenario) -> None:
     """Mark the margins in the colour bar that it covers."""
     low, high = bar.get_ylim()
-    for margin in sorted(set(zones_of(scenario).margins.tolist())):
+    for margin in sorted(set(zones_of_record(scenario).margins.tolist())):
         if low < margin < high:
             bar.axhline(margin, color=INK, linewidth=1.6)
             how: dict[str, Any] = {
@@ -199,7 +200,7 @@ def _mark(ax: Axes, point: Floats, number: int) -> None:
 
 def _draw_zones(ax: Axes, scenario: Scenario) -> None:
     """Draw the silhouettes of the zones down to the target, darker where they cross the skin."""
-    zones = zones_of(scenario)
+    zones = zones_of_record(scenario)
     if not zones:
         return
     z, y = (np.linspace(*limits, _CELLS) for limits in (ax.get_xlim(), ax.get_ylim()))

@@ -79,7 +79,7 @@ def _sheet(
     rows = [*scenes, *below, *([["field", *["."] * (len(widths) - 1)]] if field else [])]
     heights = heights + [1.0] * (len(rows) - len(scenes))
     target = f"target {scene.place(scenario, insertion.target)}"
-    title = f"{short(scenario.name, 60)}: {target} (seed {insertion.seed})"
+    title = f"{short(scenario.name, 60)}: {target} (seed {insertion.seed}){zones.name_lost(scenario)}"
     return mosaic(title, tall + 1.15 * len(rows), rows, heights, widths)
 
 

@@ -58,6 +58,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
 def _sheet(scenario: Scenario, plans: Sequence[Plan], panels: list[str]) -> tuple[Figure, dict[str, Axes]]:
     names, first = [plan.strategy for plan in plans], plans[0]
     title = f"{short(scenario.name, 60)}: plan to {scene.place(scenario, first.target)} (seed {first.seed})"
+    title += zones.name_lost(scenario)
     taller = 1.15 * ("clearance" in panels)
     if scenario.setup.axes == 1:
         rows = [*((name, name) for name in names), *((panel, "cost") for panel in panels)]

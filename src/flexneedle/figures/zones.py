@@ -17,7 +17,7 @@ from flexneedle.figures.panels import DepthPanel, Line
 from flexneedle.figures.scene import ALONG, View
 from flexneedle.figures.style import BAD, INK, ZONE, format_signed, is_column, small
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.zones import ZoneMap, workspace_corners, zones_of
+from flexneedle.simulator.zones import ZoneMap, workspace_corners, zones_of_record
 from flexneedle.types import Floats, X
 
 _CELLS, _COARSE = 360, 120  # of the raster of a section, and of a silhouette, to the right
@@ -38,7 +38,7 @@ def draw_zones(ax: Axes, scenario: Scenario, shape: Floats, view: View, *, named
 
     Along the axis only silhouettes, of zones that are not deeper than the tip.
     """
-    zones = zones_of(scenario)
+    zones = zones_of_record(scenario)
     if not zones:
         return
     if scenario.setup.axes == 2:
@@ -112,7 +112,7 @@ def draw_nearest(
     ax: Axes, scenario: Scenario, shapes: Iterable[Floats], clearance: float, view: View
 ) -> None:
     """Draw a line from shapes (n, ≥ 3) of the needle to the nearest zone, with the clearance (mm)."""
-    near = zones_of(scenario).closest(np.stack(list(shapes)), clearance)
+    near = zones_of_record(scenario).closest(np.stack(list(shapes)), clearance)
     if near is None:
         return
     ends = np.array([near.needle, near.surface])[:, view]
@@ -141,9 +141,15 @@ def clearance_panel(scenario: Scenario, lines: Iterable[Line]) -> DepthPanel:
     ends = np.array([depths.min(), depths.max()])
     margins = [
         Line("_margin" if number else "margin", ends, np.full(2, margin), BAD, ":")
-        for number, margin in enumerate(sorted(set(zones_of(scenario).margins.tolist())))
+        for number, margin in enumerate(sorted(set(zones_of_record(scenario).margins.tolist())))
     ]
     return DepthPanel("Clearance from zones (mm)", [*shown, *margins], 1.0)
+
+
+def name_lost(scenario: Scenario) -> str:
+    """Return the end of a title that names the zones that are not drawn, "" for none."""
+    line = zones_of_record(scenario).lost_zones
+    return f"; {line}" if line else ""
 
 
 def has_clearance(clearances: Floats) -> bool:

@@ -16,6 +16,7 @@ from flexneedle.record.entries import read_entries
 from flexneedle.record.folder import TRACE_FILE, read_run
 from flexneedle.record.loading import insertion_of, unfinished_note
 from flexneedle.results import Insertion, Plan, scenario_of
+from flexneedle.simulator.zones import zones_of_record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,11 +27,14 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
 
     Of a map of entries, draw `entries.png` and `.svg`.
 
-    note: called with a line if the record or its trace lacks its end.
+    note: called with a line if the record or its trace lacks its end, and for each zone that is not drawn since its
+    file is missing or has changed.
 
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
+    for reason in zones_of_record(run.scenario).lost.values():
+        note(f"not drawn: {reason}")
     if run.kind == "map":
         return save(entries_figure(read_entries(folder, run.scenario)), folder, "entries")
     if not run.plans:

@@ -8,6 +8,7 @@ from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import key_path
 from flexneedle.scenario.sections.zones import ImageSettings, ZoneFile
+from flexneedle.scenario.zone_files import find_lost
 
 
 class Range(NamedTuple):
@@ -98,13 +99,15 @@ def find_doubts(scenario: Scenario) -> list[str]:
     """Return a line for each value that is implausible.
 
     A value is implausible if it is half an order of magnitude or more outside the usual range, if it has no effect, if
-    it holds the needle from the start, or if it is the file of a zone in the frame of an unknown image.
+    it holds the needle from the start, or if it is the file of a zone in the frame of an unknown image. The file of a
+    zone that cannot be read, or has changed, has a line, too.
     """
     return [
         *_unusual(scenario),
         *_find_unused(scenario),
         *_stale(scenario),
-        *_without_image(scenario),
+        *find_unplaced(scenario),
+        *find_lost(scenario).values(),
     ]
 
 
@@ -141,7 +144,8 @@ def _stale(scenario: Scenario) -> Iterator[str]:
         yield f"phantom.delay_periods = {periods:g}: {rule}: {remedy} (setup.insertion_speed_mm_s is low)"
 
 
-def _without_image(scenario: Scenario) -> Iterator[str]:
+def find_unplaced(scenario: Scenario) -> Iterator[str]:
+    """Yield a line for each zone whose file is in the frame of an unknown image."""
     if scenario.image == ImageSettings():
         for zone in scenario.zone:
             if isinstance(zone, ZoneFile):

@@ -7,22 +7,20 @@ least margin.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.errors import InputError
-from flexneedle.files import digest_of
 from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.rigid import Rigid
 from flexneedle.mechanics import zones as kernels
 from flexneedle.plugins import load_part
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections import zones as sections
+from flexneedle.scenario.zone_files import find_lost, stamp_of
 from flexneedle.simulator.state import State
 from flexneedle.types import Floats
 
@@ -88,6 +86,7 @@ class ZoneMap:
         radius: Radius of the needle (mm).
         spacing: Largest distance (mm) between two points of the needle for which clearances are bounds.
         out_of_reach: Names of the zones that the needle cannot reach; distances from them are infinite.
+        lost: Of zones whose file cannot be used, by number, the reason; distances from them are infinite.
     """
 
     names: tuple[str, ...]
@@ -99,6 +98,7 @@ class ZoneMap:
     radius: float
     spacing: float
     out_of_reach: tuple[str, ...] = ()
+    lost: Mapping[int, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return bool(self.names)
@@ -107,6 +107,12 @@ class ZoneMap:
     def kept(self) -> Floats:
         """Distances (z,), mm, from the zones that the axis of the needle keeps with the margins."""
         return self.margins + self.added + self.radius
+
+    @property
+    def lost_zones(self) -> str:
+        """Line that names the lost zones, "" without any."""
+        names = ", ".join(self.names[number] for number in self.lost)
+        return f"zone not drawn, since its file is missing or has changed: {names}" if names else ""
 
     def clearances(self, points: Floats) -> Floats:
         """Return the clearances (z, …), mm, of the needle's surface at points (…, 3) of its axis; they are bounds.
@@ -168,8 +174,12 @@ class ZoneMap:
     def closest(self, shapes: Floats, recorded: float = math.inf) -> "Nearest | None":
         """Return where shapes (…, n, ≥ 3) of the needle have their least clearance; None if none is in tissue.
 
+        None, too, if a zone is lost, since it may be the nearest.
+
         recorded: clearance (mm) of the result, known from the contacts, which are finer than shapes.
         """
+        if self.lost:
+            return None
         points = self._refine(shapes).reshape(-1, 3)
         found = self.clearances(points)
         if not np.isfinite(found).any():
@@ -190,9 +200,18 @@ class ZoneMap:
 
 def zones_of(scenario: Scenario) -> ZoneMap:
     """Return the zones of a scenario. Raises InputError for a file that cannot be used."""
+    return _make_zones(scenario, {})
+
+
+def zones_of_record(scenario: Scenario) -> ZoneMap:
+    """Return the zones of a recorded scenario, for views: those whose file is missing or has changed are `lost`."""
+    return _make_zones(scenario, find_lost(scenario))
+
+
+def _make_zones(scenario: Scenario, lost: Mapping[int, str]) -> ZoneMap:
     if not scenario.zone:
         return NO_ZONES
-    files = tuple(_stamp(zone) for zone in scenario.zone if isinstance(zone, sections.ZoneFile))
+    files = tuple(stamp_of(zone) for number, zone in enumerate(scenario.zone) if number not in lost)
     workspace, spacing = workspace_corners(scenario), scenario.contact.spacing_mm
     return _zones_of(
         scenario.zone,
@@ -201,6 +220,7 @@ def zones_of(scenario: Scenario) -> ZoneMap:
         scenario.needle.outer_diameter,
         spacing,
         workspace,
+        tuple(lost.items()),
         files,
     )
 
@@ -213,22 +233,33 @@ def _zones_of(
     diameter: float,
     spacing: float,
     corners: tuple[tuple[float, ...], tuple[float, ...]],
-    _files: tuple[tuple[int, int], ...],
+    without: tuple[tuple[int, str], ...],
+    _files: tuple[tuple[int, int] | None, ...],
 ) -> ZoneMap:
-    """Return the map of zones; corners: of the workspace; _files: time and size of the files, of which it is made."""
+    """Return the map of zones.
+
+    corners: of the workspace; without: numbers of lost zones, and reasons; _files: time and size of the files, of which
+    it is made.
+    """
     margins = np.array([settings.margin_mm if zone.margin_mm is None else zone.margin_mm for zone in zones])
     least, radius = float(margins.min()), 0.5 * diameter
     always = sections.REGISTRATION_SDS * image.sd_mm + sag(spacing, least + radius)
     far = float(margins.max()) + always + radius + _BEYOND_MM
     low, high = map(np.array, corners)
     workspace = Workspace(low, high, far, least + radius)
-    made = [_SHAPES[type(zone)](zone, image, workspace) for zone in zones]
+    lost = dict(without)
+    made = [
+        (_NOWHERE, 0.0) if number in lost else _SHAPES[type(zone)](zone, image, workspace)
+        for number, zone in enumerate(zones)
+    ]
     shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
     packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
     exact = kernels.Zones(kernels.pack(shapes, np.inf, added).rows, packed.fields, np.inf)
     names = tuple(zone.name for zone in zones)
-    away = tuple(name for name, (shape, _) in zip(names, made, strict=True) if shape is _NOWHERE)
-    return ZoneMap(names, least, margins, added, packed, exact, radius, spacing, away)
+    away = tuple(
+        name for number, name in enumerate(names) if made[number][0] is _NOWHERE and number not in lost
+    )
+    return ZoneMap(names, least, margins, added, packed, exact, radius, spacing, away, lost)
 
 
 def target_intrusion(scenario: Scenario) -> str:
@@ -249,28 +280,6 @@ def sag(spacing: float, distance: float) -> float:
     """Return by how much the middle of two points may be nearer to a point at this distance from both (mm)."""
     half = min(0.5 * spacing, distance)
     return distance - math.sqrt(distance**2 - half**2)
-
-
-def _stamp(zone: sections.ZoneFile) -> tuple[int, int]:
-    """Return time and size of a zone's file. Raises InputError if it cannot be read, or has changed."""
-    path = Path(zone.file)
-    try:
-        found = path.stat()
-        stamp = found.st_mtime_ns, found.st_size
-        digest = _digest_of(path, stamp) if zone.sha256 else None
-    except OSError as error:
-        raise InputError(f"zone {zone.name}: {path}: cannot be read: {error.strerror}") from error
-    if digest != zone.sha256:
-        raise InputError(
-            f"zone {zone.name}: {path}: has changed since the scenario was made (sha256 {digest}); "
-            "plan again with the scenario that names it"
-        )
-    return stamp
-
-
-@lru_cache(maxsize=100)
-def _digest_of(path: Path, _stamp: tuple[int, int]) -> str:
-    return digest_of(path)
 
 
 def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -148,6 +148,11 @@ def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine):
     status, shown, _ = run(capsys, "image", "show", "abdomen/case.toml")
     (in_tmp / "mine.toml").write_text(shown)
     assert run(capsys, "scenario", "check", "mine.toml")[0] == 0
+    (in_tmp / "abdomen/abdomen.seg.nrrd").unlink()
+    status, _, err = run(capsys, "export", "planned", "--slicer", "without")
+    assert (status, "not written: zone ribs: " in err) == (0, True)
+    kept = {path.name for path in (in_tmp / "scene").iterdir() if not path.name.startswith("zone-")}
+    assert {path.name for path in (in_tmp / "without").iterdir()} == kept
 
 
 @pytest.mark.usefixtures("drawing")

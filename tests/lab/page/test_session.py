@@ -98,6 +98,17 @@ def test_implausible_values_are_doubts(session):
     assert any("youngs_modulus" in line for line in doubts)
 
 
+def test_a_zone_whose_file_is_missing_is_a_doubt_of_a_loaded_file_and_of_an_edit(session):
+    """It is not refused: an edit may leave the zone out."""
+    zone = {"shape": "file", "name": "artery", "file": "/nowhere/artery.stl"}
+    zoned = session.scenario.with_values({"zone": [zone], "image.sd_mm": 0.3})
+    loaded = session.with_file("case.toml", dump_scenario(zoned))
+    edited = session.edit_scenario({"zone": [zone], "image.sd_mm": 0.3})
+    for found in (loaded, edited):
+        (line,) = found.describe().doubts
+        assert line.startswith("zone artery: /nowhere/artery.stl: cannot be read")
+
+
 def test_a_preset_or_world_begins_a_new_scenario(session, tmp_path, monkeypatch):
     begun = session.edit_scenario({"target.depth_mm": 35.0}).with_preset("phantom3d")
     assert (begun.describe().changed, begun.name) == ([], "phantom3d")

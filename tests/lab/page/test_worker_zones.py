@@ -33,7 +33,7 @@ def test_the_scene_has_the_places_that_move_with_each_zone(tmp_path):
 
 def test_a_zone_has_its_surface_and_the_one_of_its_margin():
     scenario = with_zones("phantom3d", SPHERE)
-    (zone,) = describe_zones(scenario, "scene").zones
+    (zone,) = describe_zones(scenario, zones_of(scenario), "scene").zones
     kept = zones_of(scenario).kept[0]
     assert (zone.name, zone.margin_mm) == ("node", 2.0)
     for surface, radius in ((zone.surface, 3.0), (zone.margin, 3.0 + kept)):
@@ -72,3 +72,15 @@ def test_a_recording_has_zones_after_the_insertion_and_the_nearest_in_each_row()
     rows = reports[-1].rows
     assert rows[0]["nearest"] is None  # before the skin
     assert rows[-1]["nearest"]["zone"] == "node"
+
+
+def test_a_recording_names_a_zone_whose_file_is_missing_without_its_path():
+    lost = {"name": "ring", "shape": "file", "file": "/nowhere/ring.nrrd", "segment": "ring"}
+    made = replace(make_insertion(), scenario=with_zones("phantom", lost, SPHERE))
+    insertion, found, rows = (
+        one for one in describe_recording(made, "mine", "first", "") if not isinstance(one, ShapeFrame)
+    )
+    assert insertion.summary.endswith(": ring")
+    assert "nowhere" not in insertion.summary
+    assert [len(zone.surface.points) > 0 for zone in found.zones] == [False, True]
+    assert rows.rows[-1]["nearest"] is None

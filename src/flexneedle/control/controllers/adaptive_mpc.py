@@ -365,4 +365,5 @@ CONTROLLER = Controller(
     decide=decide,
     settings=AdaptiveMpc,
     predicts=True,
+    avoids_zones=True,
 )

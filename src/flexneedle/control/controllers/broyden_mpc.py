@@ -208,4 +208,5 @@ CONTROLLER = Controller(
     decide=decide,
     settings=BroydenMpc,
     needs_guide=True,
+    avoids_zones=True,
 )

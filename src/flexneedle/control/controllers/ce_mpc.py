@@ -27,4 +27,5 @@ CONTROLLER = Controller(
     StateCorrection(fits_start=False, estimates_load=False),
     decide=decide,
     settings=mpc.CeMpc,
+    avoids_zones=True,
 )

@@ -158,6 +158,7 @@ def _export(args: argparse.Namespace) -> int:
     from flexneedle.record.entries import read_entries
     from flexneedle.record.folder import read_run
     from flexneedle.record.loading import load_insertion
+    from flexneedle.simulator.zones import zones_of_record
 
     run = read_run(args.run)
     if run.kind == "map":
@@ -173,6 +174,8 @@ def _export(args: argparse.Namespace) -> int:
         paths = write_scene(run.plans, args.slicer)
     for path in paths:
         print(path)
+    for reason in zones_of_record(run.scenario).lost.values():
+        print_note(f"not written: {reason}")
     print(
         f"frame: {'image' if has_image(run.scenario) else 'needle, since the run has no image'} (LPS in files)"
     )

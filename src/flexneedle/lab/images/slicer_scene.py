@@ -19,7 +19,7 @@ from flexneedle.mechanics.zones import fill_distances
 from flexneedle.planning.entry_map import EntryMap
 from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.zones import ZoneMap, zones_of
+from flexneedle.simulator.zones import ZoneMap, zones_of_record
 from flexneedle.types import Floats
 
 NEEDLE, TRANSFORM = "needle.ply", "needle-to-image.tfm"
@@ -31,8 +31,8 @@ _BESIDE_MM, _SPACING_MM = 40.0, 1.0  # of the surfaces of zones
 def write_scene(run: Insertion | dict[str, Plan], folder: Path) -> list[Path]:
     """Write the files of an insertion, or of plans by strategy, in the frame of the scenario's image; return them.
 
-    The frame is the needle's if the scenario has no image. Raises InputError for a zone that cannot be read or a folder
-    that cannot be created, RecordError if a file cannot be written.
+    The frame is the needle's if the scenario has no image. A zone is left out if its file is missing or has changed.
+    Raises InputError for a folder that cannot be created, RecordError if a file cannot be written.
     """
     plans = {run.plan.strategy: run.plan} if isinstance(run, Insertion) else run
     scenario = _scenario_of(run, next(iter(plans.values())))
@@ -146,8 +146,8 @@ def _map_markup(markup: Markup, to_image: Rigid) -> Markup:
 
 
 def _zones(scenario: Scenario) -> Iterator[tuple[str, Mesh]]:
-    """Yield name and surface of each zone, and of its margin with what is added to it, near the insertion."""
-    zones = zones_of(scenario)
+    """Yield name and surface of each zone that is not lost, and of its margin with what is added to it."""
+    zones = zones_of_record(scenario)
     entry, depth = scenario.entry, scenario.setup.max_depth
     low = np.array([0.0, entry.lateral_mm - _BESIDE_MM, entry.lateral_z_mm - _BESIDE_MM])
     counts = np.ceil((np.array([depth, 2.0 * _BESIDE_MM, 2.0 * _BESIDE_MM])) / _SPACING_MM).astype(int) + 1

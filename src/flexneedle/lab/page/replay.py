@@ -17,6 +17,8 @@ from flexneedle.lab.page.shape_frames import ShapeFrame, pack_frame
 from flexneedle.lab.page.worker.recordings import describe_recording
 from flexneedle.record.folder import read_run
 from flexneedle.record.loading import load_insertion, unfinished_note
+from flexneedle.results import scenario_of
+from flexneedle.simulator.zones import zones_of_record
 
 _STATIC = Path(__file__).with_name("static")
 _TEMPLATE = Path(__file__).with_name("replay.html")
@@ -36,7 +38,7 @@ def make_replay(
     """Return the HTML file that replays the insertion of a run's folder, beside the insertion of a second one.
 
     It needs no network and no other file, and is the same for the same runs. note: called with a line if a trace lacks
-    its end.
+    its end, and for each zone whose file is missing or has changed.
 
     Raises InputError if a folder contains no insertion, RunError if it is not finished or has no control period.
     """
@@ -149,8 +151,9 @@ def _describe(
     insertion, lacking = load_insertion(folder)
     if not insertion.periods:
         raise RunError(f"{folder}: nothing to replay: no control period is recorded")
-    if lacking:
-        note(lacking)  # it contains the file's path, which the replay must not
+    lost = [f"not drawn: {reason}" for reason in zones_of_record(scenario_of(insertion)).lost.values()]
+    for line in filter(None, (lacking, *lost)):
+        note(line)  # it contains the file's path, which the replay must not
     return describe_recording(insertion, _name(folder), of, _INCOMPLETE if lacking else "")
 
 

@@ -89,7 +89,7 @@ class InsertionReporter:
     def report_plan(self, plan: Plan) -> None:
         """Report the plan."""
         self.plan, self.zones = plan, zones_of(self.task.scenario)
-        self.task.report(describe_zones(self.task.scenario, "live"))
+        self.task.report(describe_zones(self.task.scenario, self.zones, "live"))
         self.task.report(shapes_of(plan, FrameSource.LIVE)[0])
         self.task.report_job("running", 0.0, "planned")
 

@@ -53,7 +53,7 @@ def warm_up() -> None:
 
 def needle(task: WorkerTask) -> None:
     """Report the zones of a scenario, and the needle at the start, bent by its guide."""
-    task.report(describe_zones(task.scenario, "scene"))
+    task.report(describe_zones(task.scenario, zones_of(task.scenario), "scene"))
     nodes = Simulator(task.scenario, threads=1).start().nodes[:, :3]
     task.report(make_frame(FrameKind.NEEDLE, FrameSource.SCENE, 0, nodes))
 

@@ -22,7 +22,7 @@ from flexneedle.record.loading import load_insertion
 from flexneedle.record.saving import save
 from flexneedle.results import Insertion, Period, scenario_of
 from flexneedle.simulator.state import Contacts
-from flexneedle.simulator.zones import zones_of
+from flexneedle.simulator.zones import zones_of_record
 from flexneedle.types import Floats, Shape
 
 
@@ -44,13 +44,18 @@ def report_recording(
 def describe_recording(
     insertion: Insertion, name: str, of: Recording, note: str, row: int | None = None
 ) -> Iterator[ServerMessage | ShapeFrame]:
-    """Yield messages and frames of a recorded insertion. note: added to its summary; row: of its study."""
+    """Yield messages and frames of a recorded insertion. note: added to its summary; row: of its study.
+
+    The summary also names the zones that are lost.
+    """
     plan, source, error = insertion.plan, FrameSource[of.upper()], insertion.error_mm
+    scenario = scenario_of(insertion)
+    zones = zones_of_record(scenario)
     yield InsertionMessage(
         of=of,
         name=name,
         state=str(insertion.outcome),
-        summary="; ".join(filter(None, (insertion.summary, note))),
+        summary="; ".join(filter(None, (insertion.summary, note, zones.lost_zones))),
         controller=insertion.controller,
         seed=insertion.seed,
         target=insertion.target,
@@ -60,13 +65,12 @@ def describe_recording(
         load=insertion.invasiveness.rows(),
         rig=insertion.rig,
         row=row,
-        scene=describe_scene(scenario_of(insertion), 0),
+        scene=describe_scene(scenario, 0),
     )
-    yield describe_zones(scenario_of(insertion), of)
+    yield describe_zones(scenario, zones, of)
     yield make_frame(FrameKind.PATH, source, 0, plan.tips[:, :3])
     if insertion.periods:
         yield from frames_of(insertion.periods, source)
-    zones = zones_of(scenario_of(insertion))
     yield RowsMessage(
         of=of, first=0, rows=[describe_row(period, plan, zones) for period in insertion.periods]
     )

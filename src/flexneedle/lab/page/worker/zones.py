@@ -10,15 +10,17 @@ from flexneedle.record.fields import page_values
 from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.surfaces import zone_surface
-from flexneedle.simulator.zones import ZoneMap, workspace_corners, zones_of
+from flexneedle.simulator.zones import ZoneMap, workspace_corners
 from flexneedle.types import Floats
 
 _DIGITS = 3  # of coordinates in mm
 
 
-def describe_zones(scenario: Scenario, of: Literal["scene", "live", "first", "second"]) -> ZonesMessage:
-    """Return the message about the zones of a scenario. Raises InputError for a file that cannot be read."""
-    zones, (low, high) = zones_of(scenario), map(np.array, workspace_corners(scenario))
+def describe_zones(
+    scenario: Scenario, zones: ZoneMap, of: Literal["scene", "live", "first", "second"]
+) -> ZonesMessage:
+    """Return the message about the zones of a scenario."""
+    low, high = map(np.array, workspace_corners(scenario))
 
     def surface(number: int, distance: float) -> ZoneSurface:
         found = zone_surface(zones, number, low, high, distance)
