@@ -196,3 +196,9 @@ def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
     np.testing.assert_allclose(late, [np.exp(-2.0), np.exp(-1.0), 0.0])
     at_target = terms.late_rolls(replace(TRAJECTORIES, controls=controls, tips=tips), depth=35.0, length=5.0)
     assert at_target[1] == 1.0
+
+
+def test_clearance_below_what_is_wanted_and_intrusion_are_charged_at_the_nearest_step():
+    near = replace(TRAJECTORIES, clearance=np.array([[np.inf, 2.6, 4.0], [1.4, 2.0, -0.2]]))
+    np.testing.assert_allclose(terms.little_clearance(near, wanted=3.0), [0.4, 3.2])
+    np.testing.assert_allclose(terms.intrusion(near, clear=2.0), [0.0, 2.2 + 0.1 * 2.8 / 3.0 + 0.3])

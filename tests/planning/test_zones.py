@@ -64,6 +64,19 @@ def test_a_zone_in_the_way_is_passed_at_its_margin_by_both_models(preset):
     assert flexneedle.plan(scenario).controls.tobytes() == plan.controls.tobytes()
 
 
+@pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
+def test_a_plan_past_a_zone_leaves_room_to_correct(preset):
+    """The target is in the inner half of the bevel's reach from the entry, and the zone is farther than its margin."""
+    plan = flexneedle.plan(in_the_way(preset))
+    depth = plan.target[0]
+    least, greatest = planner.bevel_reach(
+        plan.scenario.with_values({"target.lateral_mm": 0.0, "target.lateral_z_mm": 0.0}), depth
+    )
+    off = abs(complex(*plan.target[1:]) - plan.scenario.entry.lateral(depth))
+    assert off <= 0.5 * 0.5 * (greatest - least) + 0.02
+    assert plan.least_clearance_mm >= 2.8
+
+
 def test_margins_of_zones_count_each_by_itself():
     scenario = in_the_way("phantom")
     wide = flexneedle.plan(scenario.with_values({"zone.0.margin_mm": 2.8}))
