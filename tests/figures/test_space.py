@@ -107,7 +107,7 @@ def test_the_target_has_its_circle_in_every_view_and_is_named_with_both_offsets(
         (circle,) = (patch for patch in ax.patches if isinstance(patch, Circle))
         assert circle.center == tuple(INSERTION.target[column] for column in view)
         assert circle.radius == 1.0
-    target = "target 40 mm deep, 4.12668 mm and 2.82321 mm lateral"
+    target = "target 40 mm deep, 4.13 mm and 2.82 mm lateral"
     found = [text.replace("\n", " ") for text in texts(drawn("reached"))]
     assert f"Two-layer tissue phantom in space: {target} (seed 0)" in found
 

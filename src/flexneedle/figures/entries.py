@@ -16,7 +16,6 @@ from flexneedle.figures.style import (
     QUIET,
     ZONE,
     apply_style,
-    format_signed,
     is_column,
     small,
 )
@@ -50,9 +49,9 @@ class _Quantity(NamedTuple):
 def entries_figure(found: EntryMap) -> Figure:
     """Return the figure of a map of entries."""
     scenario, shown = found.scenario, _quantities(found)
-    target = ", ".join(format_signed(value) for value in scenario.target.position[: 1 + scenario.setup.axes])
-    clear = f"{found.clear.sum()} of {len(found.clear)} entries"
-    title = f"{short(scenario.name, 40)}: clear insertions to ({target}) mm from {clear}{name_lost(scenario)}"
+    target = scene.place(scenario, scenario.target.position)
+    clear = f"{found.clear.sum()} of {len(found.clear)} entries clear"
+    title = f"{short(scenario.name, 40)}: {clear}, to {target}{name_lost(scenario)}"
     with apply_style():
         if scenario.setup.axes == 1:
             names = [name.partition(" ")[0] for name in shown]
@@ -208,6 +207,7 @@ def _draw_zones(ax: Axes, scenario: Scenario) -> None:
     depth, up, right = np.meshgrid(x, y, z, indexing="ij")
     clearances = zones.clearances(np.stack([depth, up, right], axis=-1))
     distances = clearances + zones.radius + zones.added[:, None, None, None]
+    flat = distances.min(axis=1)
     for name, each in zip(zones.names, distances, strict=True):
         for layers, alpha in ((each, 0.16), (each[:1], 0.3)):
             least = layers.min(axis=0)
@@ -217,16 +217,17 @@ def _draw_zones(ax: Axes, scenario: Scenario) -> None:
         if each.min() < 0.0:
             ax.fill([], [], color=ZONE, alpha=0.16, label="zone, silhouette (darker at the skin)")
             if not is_column():
-                _name(ax, z, y, each.min(axis=0), name)
+                others = np.delete(flat, zones.names.index(name), axis=0).min(axis=0, initial=np.inf)
+                _name(ax, z, y, each.min(axis=0), others, name)
 
 
-def _name(ax: Axes, z: Floats, y: Floats, distances: Floats, name: str) -> None:
-    """Write the name of a zone where it is deep, near the middle; not at the edge, where it would be cut."""
+def _name(ax: Axes, z: Floats, y: Floats, distances: Floats, others: Floats, name: str) -> None:
+    """Write the name of a zone where it is deep, away from others, near the middle; not at the edge, which cuts it."""
     edge = round(_EDGE * len(z))
     right, up = np.meshgrid(z[edge:-edge], y[edge:-edge])
-    inner = distances[edge:-edge, edge:-edge]
+    inner, covered = (each[edge:-edge, edge:-edge] for each in (distances, np.maximum(-others, 0.0)))
     away = np.hypot(right - z.mean(), up - y.mean())
-    k = int((inner + _CENTRAL * away).argmin())
+    k = int(np.where(inner < 0.0, inner + covered + _CENTRAL * away, np.inf).argmin())
     if inner.flat[k] >= 0.0:
         return
     where = float(right.flat[k]), float(up.flat[k])

@@ -70,7 +70,7 @@ def color_of(record: Plan | Insertion) -> str:
 
 def place(scenario: Scenario, target: Point) -> str:
     """Return a target as text."""
-    depth, *lateral = (f"{format_signed(value)} mm" for value in target[: 1 + scenario.setup.axes])
+    depth, *lateral = (f"{format_signed(round(value, 2))} mm" for value in target[: 1 + scenario.setup.axes])
     return f"{depth} deep, {' and '.join(lateral)} lateral"
 
 
@@ -139,15 +139,8 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
         how: dict[str, Any] = {"color": GUIDE, "linewidth": 1.0, "marker": "_", "gid": UPRIGHT}
         ax.plot([beside, beside], ends, label="guide travel", **how)
     ax.plot([beside], [y], color=GUIDE, marker=">", markersize=4, linestyle="none")
-    above: dict[str, Any] = {"xytext": (0, 3), "ha": "left", "va": "bottom"}
-    ax.annotate(
-        "guide",
-        (x - _WIDE, y + _OPENING + _BLOCK),
-        color=GUIDE,
-        **above,
-        textcoords="offset points",
-        fontsize=small(),
-    )
+    jaw_side, how = (x + _WIDE, y + _OPENING + 0.5 * _BLOCK), {"color": GUIDE, "fontsize": small()}
+    ax.annotate("guide", jaw_side, xytext=(3, 0), textcoords="offset points", va="center", **how)
 
 
 def draw_needle(

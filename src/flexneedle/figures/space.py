@@ -128,6 +128,7 @@ def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
     ring.set_gid("guide")
     ax.add_patch(ring)
     up = 1 if target[Y] < y[-1] else -1
-    beside: dict[str, Any] = {"ha": "center", "va": "bottom" if up > 0 else "top", "fontsize": small()}
+    side = {1: "right", -1: "left"}.get(int(np.sign(z[-1] - target[Z])), "center")  # towards the target
+    beside: dict[str, Any] = {"ha": side, "va": "bottom" if up > 0 else "top", "fontsize": small()}
     beside |= {"xytext": (0, 2 * up), "textcoords": "offset points", "color": GUIDE}
     ax.annotate("guide" if is_column() else "guide and its path", (z[-1], y[-1] + up * _RING), **beside)
