@@ -52,6 +52,29 @@ def test_the_depth_of_the_tip_is_the_trackers_whatever_the_axis_makes_of_a_comma
     assert estimate.state.travel[DB_X] == pytest.approx(50.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("turn", [-0.006, 0.006])
+@pytest.mark.parametrize("observer", OBSERVERS)
+def test_an_oblique_needle_that_starts_turned_advances_as_commanded(observer, turn):
+    """Turning it moves its tip along the axis: no sign of a scale."""
+    scenario = SCENARIOS["phantom"].with_values(
+        {"entry.slope_mrad": 180.0, "control.start_angle_sd_mrad": 3.0}
+    )
+    simulator, slope = Simulator(scenario, 1), scenario.entry.slope.real
+    start = simulator.start()
+    truth = simulator.step(start.with_estimate(slope=(slope + turn,)), Control())
+    estimate, scales = OBSERVERS[observer].begin(begun_with(simulator)), []
+    for k in range(25):
+        row = Control(db_x=1.0, db_y=slope)
+        truth = simulator.replay(truth, np.array([row]))[0]
+        estimate = estimate.move(Motion(row, k, k + 1.0)).observe(
+            [Measurement(k + 1.0, *truth.tip[:2].tolist())]
+        )
+        scales.append(estimate.axial_scale)
+    np.testing.assert_allclose(scales, 1.0, atol=3e-3)
+    np.testing.assert_allclose(estimate.tip[:2], truth.tip[:2], atol=0.03)
+    assert estimate.even_advance.scale == pytest.approx(1.0, abs=3e-3)
+
+
 ADVANCES = np.arange(12) % 4 > 0  # every fourth move is a rest in tissue
 
 

@@ -64,6 +64,7 @@ class Corrected:
     axial: Floats  # covariance (2, 2) of the start along the axis (mm) and of the scale of the advance before `moves`
     tips: Floats  # estimated tip poses (k + 1, 5) at the ends of the moves, the start first
     drift: float  # standard deviation of the path's curvature (1/mm)
+    axial_start: float = 0.0  # start error along the axis (mm), of the tip
     axial_scale: float = 1.0  # advance of the needle over the commanded advance
     # commanded advance, readings minus it (mm), and their variance (mm²), of the moves before `moves`
     advances: tuple[tuple[float, float, float], ...] = ()
@@ -149,6 +150,7 @@ class Corrected:
             past=past.state,
             covariance=past.covariance,
             axial=past.axial,
+            axial_start=past.axial_start,
             axial_scale=past.axial_scale,
             advances=past.advances,
             moves=moves[closed:],
@@ -205,12 +207,12 @@ def _correct_axially(at: Corrected, done: Move, off: float, noise: float) -> tup
     spread = at.axial @ sensitivity
     gain = spread / (sensitivity @ spread + noise**2 + 1e-12)
     start, scale = (gain * off).tolist()
-    shifted = float(at.state.base[X]) - at.simulator.scenario.start_base_x - before
-    ahead = shifted + (at.axial_scale - 1.0) * float(sensitivity[1] - before) + off
+    ahead = at.axial_start + (at.axial_scale - 1.0) * float(sensitivity[1]) + off
     moved = at.state.with_estimate(base_x=float(at.state.base[X]) + start + scale * before)
     corrected = replace(
         at,
         axial=at.axial - np.outer(gain, spread),
+        axial_start=at.axial_start + start,
         axial_scale=at.axial_scale + scale,
         advances=(*at.advances, (float(sensitivity[1]), ahead, noise**2)),
     )
@@ -244,8 +246,17 @@ def _fit_start(at: Corrected, predicted: State, innovation: Floats, noise: float
         (predicted.base[first : first + axes] + one * innovation[:axes]).tolist()
         for first, one in zip((Y, THETA), gain.tolist(), strict=True)
     )
-    corrected = simulator.step(predicted.with_estimate(base=base, slope=slope), STILL)
+    turned = predicted.with_estimate(base=base, slope=slope)
+    # An oblique needle that is turned moves along the axis, too, but the readings along it say where its tip is.
+    along = _read_share(at) * float(predicted.tip[X] - simulator.step(turned, STILL).tip[X])
+    corrected = simulator.step(turned.with_estimate(base_x=float(turned.base[X]) + along), STILL)
     return replace(at, state=corrected, covariance=at.covariance - np.outer(gain, spread))
+
+
+def _read_share(at: Corrected) -> float:
+    """Return the share of the start's variance along the axis that readings have removed; 0 for a known start."""
+    prior = at.simulator.scenario.control.start_axial_sd_mm**2
+    return 1.0 - float(at.axial[0, 0]) / prior if prior else 0.0
 
 
 def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: float) -> float:
