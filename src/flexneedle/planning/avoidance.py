@@ -1,13 +1,13 @@
 """Plans that keep the margins of zones, found where a plan without zones does not (`planning.detours`)."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from flexneedle.planning.carry_out import carry_out, make_rollout
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.detours import refine, search_detours
+from flexneedle.planning.detours import lengthen, refine, search_detours
 from flexneedle.planning.freedom import find_freedom
 from flexneedle.planning.horizon import OnIteration, count_iterations, search_settings
 from flexneedle.planning.primitives import Solution
@@ -19,7 +19,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.excess import LoadLimits
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.zones import ZoneMap
-from flexneedle.types import Floats
+from flexneedle.types import DB_X, Floats
 
 PRECISE_MM = 0.1
 """Miss of a plan above which other searches are made."""
@@ -50,27 +50,27 @@ def avoid_zones(
     after = count_iterations(progress, found.iterations, usual, np.inf)
     solutions = search_detours(rollout, shapes_of, around, room, search, rng, after)
     tries = _Tries(found)
-    for solution in solutions:
-        clear, before = zones.margin + _RESERVE_MM, np.inf
-        for repeat in range(1 + _REPEATS):
-            new = tries.add(
-                carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution
-            )
-            near = _off(new) <= min(_MENDED_MM, before) and solution.terms["zones"] <= _CLEAR_MM
-            if tries.found or repeat == _REPEATS or not near:
+
+    def attempt(solution: Solution, own: PlanProblem) -> _Try:
+        plan = carry_out(simulator, problem, zones, found.strategy, found.seed, solution)
+        return tries.add(_Try(plan, solution, own))
+
+    for solution, own in solutions:
+        clear, before, new = zones.margin + _RESERVE_MM, np.inf, attempt(solution, own)
+        for repeat in range(_REPEATS):
+            near = new.off <= min(_MENDED_MM, before) and new.solution.terms["zones"] <= _CLEAR_MM
+            if tries.found or not near:
                 break
-            clear, before = clear + (1 + repeat) * new.intrusion_mm, _MENDED * _off(new)
-            farther = replace(around, clear=clear, spare=0.0)
-            solution = refine(rollout, farther, solution, search, rng, progress)
+            clear, before = clear + (1 + repeat) * new.plan.intrusion_mm, _MENDED * new.off
+            mended = new.mend(clear)
+            new = attempt(refine(rollout, mended, new.solution, search, rng, progress), mended)
         if tries.found:
             break
-    if not tries.found and tries.solution is not None and _off(tries.best) <= _NEARLY_MM:
+    if not tries.found and tries.best and tries.best.off <= _NEARLY_MM:
         more = replace(search, samples=_MORE * search.samples, elite=_MORE * search.elite)
-        clear = zones.margin + _RESERVE_MM + 2.0 * tries.best.intrusion_mm
-        farther = replace(around, clear=clear, spare=0.0)
-        solution = refine(rollout, farther, tries.solution, more, rng, progress)
-        tries.add(carry_out(simulator, problem, zones, found.strategy, found.seed, solution), solution)
-    best = replace(tries.best, history=tries.history, iterations=len(tries.history))
+        mended = tries.best.mend(zones.margin + _RESERVE_MM + 2.0 * tries.best.plan.intrusion_mm)
+        attempt(refine(rollout, mended, tries.best.solution, more, rng, progress), mended)
+    best = tries.plan
     if best.hit or best.limit.startswith("guard."):
         return best
     closest = zones.closest(best.shapes)
@@ -79,24 +79,52 @@ def avoid_zones(
     return replace(best, limit=f"{limit}; {help_by} may suffice" if help_by else limit)
 
 
+@dataclass(frozen=True, eq=False)
+class _Try:
+    """A plan, the solution that it carries out, and the problem that this solves."""
+
+    plan: Plan
+    solution: Solution
+    problem: PlanProblem
+
+    @property
+    def off(self) -> float:
+        """Intrusion into margins and miss of the plan beyond what is precise (mm)."""
+        return _off(self.plan)
+
+    def mend(self, clear: float) -> PlanProblem:
+        """Return the problem at a clearance (mm), without a preference for more, and with the travel of the plan.
+
+        The search measures the miss of a needle that ends short of the target's depth on its tangent.
+        """
+        short = float(self.plan.controls[:, DB_X].sum() - self.solution.controls[:, DB_X].sum())
+        return lengthen(replace(self.problem, clear=clear, spare=0.0), short)
+
+
 class _Tries:
-    """The best of the plans that were tried, its solution, and the history of all."""
+    """The plan without zones, the best of the tries, and the history of all."""
 
     def __init__(self, found: Plan) -> None:
-        self.best, self.history = found, found.history
-        self.solution: Solution | None = None
+        self._without, self._history = found, found.history
+        self.best: _Try | None = None
 
-    def add(self, plan: Plan, solution: Solution) -> Plan:
-        """Add a plan and return it."""
-        self.history = (*self.history, *plan.history)
-        if _rank(plan) < _rank(self.best):
-            self.best, self.solution = plan, solution
-        return plan
+    def add(self, new: _Try) -> _Try:
+        """Add a try and return it."""
+        self._history = (*self._history, *new.plan.history)
+        if _rank(new.plan) < _rank(self.best.plan if self.best else self._without):
+            self.best = new
+        return new
+
+    @property
+    def plan(self) -> Plan:
+        """The best plan, with the history of all."""
+        best = self.best.plan if self.best else self._without
+        return replace(best, history=self._history, iterations=len(self._history))
 
     @property
     def found(self) -> bool:
         """Whether the best plan keeps all margins and reaches its target precisely."""
-        return self.best.hit and self.best.error_mm <= PRECISE_MM
+        return self.best is not None and self.best.plan.hit and self.best.plan.error_mm <= PRECISE_MM
 
 
 def sketch_detour(
@@ -110,9 +138,8 @@ def sketch_detour(
     around = _go_around(simulator, problem, zones)
     shapes_of, room = make_rollout(simulator, (), at_end=("shapes",)), make_room(simulator.scenario, zones)
     short = replace(_search_settings(simulator), iterations=_SKETCHED, usual=_SKETCHED)
-    return next(
-        search_detours(make_rollout(simulator, around.terms), shapes_of, around, room, short, rng, progress)
-    )
+    rollout = make_rollout(simulator, around.terms)
+    return next(search_detours(rollout, shapes_of, around, room, short, rng, progress))[0]
 
 
 def _go_around(simulator: Simulator, problem: PlanProblem, zones: ZoneMap) -> PlanProblem:

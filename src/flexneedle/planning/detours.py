@@ -17,7 +17,7 @@ from flexneedle.planning.horizon import Found, OnIteration, Variables, count_ite
 from flexneedle.planning.primitives import Solution, make_controls, make_solution, variables_of
 from flexneedle.planning.problem import PlanProblem
 from flexneedle.planning.ways import Room, correct_miss, find_ways
-from flexneedle.types import Floats
+from flexneedle.types import Floats, X
 
 _WAYS = 16  # that are simulated
 _RACED = 3
@@ -40,34 +40,36 @@ def search_detours(
     search: Search,
     rng: np.random.Generator,
     progress: OnIteration,
-) -> Iterator[Solution]:
-    """Yield plans that avoid zones as far as possible, likely the best first.
+) -> Iterator[tuple[Solution, PlanProblem]]:
+    """Yield plans that avoid zones as far as possible, likely the best first, each with its problem, of enough travel.
 
     rollout: with the outputs for the terms of the problem; shapes_of: with the shapes at the end.
     """
     z = find_ways(shapes_of, problem, room, _WAYS, rng)
     z = correct_miss(shapes_of, problem, np.clip(z, variables_of(problem).lower, variables_of(problem).upper))
-    costs = evaluate_cost(problem.terms, rollout(make_controls(problem, z)[0]))
+    simulated = rollout(make_controls(problem, z)[0])
+    costs = evaluate_cost(problem.terms, simulated)
+    longer = [lengthen(problem, more) for more in (problem.target[0] - simulated.tips[:, -1, X]).tolist()]
     order = np.argsort(costs, kind="stable")
     laps, done = replace(search, iterations=_LAPS), 0
     usual = search.usual or search.iterations
     search = replace(search, iterations=min(search.iterations, 2 * usual))
     for first in range(0, min(len(order), _ROUNDS * _RACED), _RACED):
-        raced: list[Found] = []
+        raced: list[tuple[Found, PlanProblem]] = []
         near = costs[order] <= costs[order[first]] + _FAR_BEHIND_MM
         for k in order[first : first + _RACED][near[first : first + _RACED]]:
-            best = min((one.cost for one in raced), default=np.inf)
+            best = min((one.cost for one, _ in raced), default=np.inf)
             shown = count_iterations(progress, done, done + search.iterations, best)
-            one = find_best(variables_about(problem, z[k]), rollout, problem.terms, laps, rng, progress=shown)
-            raced.append(one)
-            done += one.search_state.iterations
-        one = min(raced, key=lambda each: each.cost)
+            about = variables_about(longer[k], z[k])
+            raced.append((find_best(about, rollout, problem.terms, laps, rng, progress=shown), longer[k]))
+            done += raced[-1][0].search_state.iterations
+        one, own = min(raced, key=lambda each: each[0].cost)
         if not one.search_state.converged and one.cost <= _LOST_MM:
             shown = count_iterations(progress, done, done + search.iterations, one.cost)
-            about, begun = variables_about(problem, one.z), one.search_state
+            about, begun = variables_about(own, one.z), one.search_state
             one = find_best(about, rollout, problem.terms, search, rng, progress=shown, begun=begun)
             done += one.search_state.iterations
-        yield make_solution(problem, one)
+        yield make_solution(own, one), own
         if one.cost > _HOPELESS_MM:
             return
 
@@ -84,6 +86,11 @@ def refine(
     about = variables_about(problem, solution.search_state.best)
     search = replace(search, iterations=_REFINED, usual=_REFINED)
     return make_solution(problem, find_best(about, rollout, problem.terms, search, rng, progress=progress))
+
+
+def lengthen(problem: PlanProblem, more: float) -> PlanProblem:
+    """Return the problem with more travel (mm), within the stroke: a bent needle ends short of the target's depth."""
+    return replace(problem, travel=min(problem.travel + more, float(problem.reach[0])))
 
 
 def variables_about(problem: PlanProblem, z: Floats) -> Variables:
