@@ -26,7 +26,7 @@ def test_a_row_of_a_plan_has_times_and_the_clearance_of_the_exact_rod():
 
 
 def test_a_zone_that_is_displaced_towards_the_needle_is_not_touched_without_terms_of_zones():
-    (row,) = zone_rooms.insert_room((5, True, False), sd=0.0, displaced=6.0, blind=True, draws=1)
+    (row,) = zone_rooms.insert_room((5, True, False), sd=0.0, displaced=9.0, blind=True, draws=1)
     assert row["outcome"] == "held"
     assert row["clearance"] > 0.3
 
