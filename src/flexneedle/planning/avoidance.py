@@ -66,7 +66,7 @@ def avoid_zones(
             new = attempt(refine(rollout, mended, new.solution, search, rng, progress), mended)
         if tries.found:
             break
-    if not tries.found and tries.best and tries.best.off <= _NEARLY_MM:
+    if not tries.plan.hit and tries.best and tries.best.off <= _NEARLY_MM:
         more = replace(search, samples=_MORE * search.samples, elite=_MORE * search.elite)
         mended = tries.best.mend(zones.margin + _RESERVE_MM + 2.0 * tries.best.plan.intrusion_mm)
         attempt(refine(rollout, mended, tries.best.solution, more, rng, progress), mended)
