@@ -9,7 +9,7 @@ import numpy as np
 
 from flexneedle import load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.zones import DistanceGrid, Workspace
+from flexneedle.simulator.zones import DistanceGrid, FileZone, Workspace
 
 SPHERE = {"name": "node", "shape": "sphere", "center_mm": [25.0, 9.0, 0.0], "radius_mm": 3.0}
 CAPSULE = {
@@ -36,13 +36,14 @@ class GridReader:
     The ring has a radius of 6 mm about the point x = 30 mm, and is 2 mm thick; the grid errs by 0.1 mm.
     """
 
-    def __call__(self, _zone: object, _to_needle: object, workspace: Workspace) -> DistanceGrid:
+    def __call__(self, _zone: object, _to_needle: object, workspace: Workspace) -> FileZone:
         """Return the distances from the ring."""
         spacing = 0.5
         counts = np.ceil((workspace.high - workspace.low) / spacing).astype(int) + 1
         axes = [low + spacing * np.arange(count) for low, count in zip(workspace.low, counts, strict=True)]
         x, y, z = np.meshgrid(*axes, indexing="ij")
-        return DistanceGrid(np.hypot(np.hypot(y, z) - 6.0, x - 30.0) - 2.0, workspace.low, spacing, 0.1)
+        values = np.hypot(np.hypot(y, z) - 6.0, x - 30.0) - 2.0
+        return FileZone(DistanceGrid(values, workspace.low, spacing, 0.1), None)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from commands import names, run
 from flexneedle.cli.common import clearance_rows, out_of_reach_rows
 from flexneedle.invasiveness import format_number
 from flexneedle.scenario.files import dump_scenario, load_scenario
-from flexneedle.simulator.zones import zones_of
+from flexneedle.simulator.zones import FileZone, zones_of
 from zoned import SPHERE, grid_files, with_zones
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -108,7 +108,7 @@ def test_a_target_in_a_margin_is_refused_before_the_search(options, capsys, in_t
 def test_a_zone_out_of_reach_is_named_without_a_clearance(in_tmp):
     with (
         grid_files(in_tmp) as ring,
-        patch("flexneedle.simulator.zones.load_part", lambda *_: lambda *_: None),
+        patch("flexneedle.simulator.zones.load_part", lambda *_: lambda *_: FileZone(None, None)),
     ):
         scenario = with_zones("phantom", ring)
         straight = np.pad(np.arange(-60.0, 41.0)[:, None], ((0, 0), (0, 4)))

@@ -109,17 +109,20 @@ def load_named(args: argparse.Namespace) -> Scenario:
 def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
     """Return the scenario with the requested target and all controller settings.
 
-    Raises ScenarioError. Warns, as `scenario check`, of zones whose place is in doubt.
+    Raises ScenarioError. Warns, as `scenario check`, of zones whose place or image is in doubt.
     """
     from flexneedle.control.controllers import with_controller_defaults
     from flexneedle.errors import ScenarioWarning
     from flexneedle.scenario.plausible import find_unplaced
+    from flexneedle.simulator.zone_doubts import find_zone_doubts
 
     source = args.image or args.scenario
     scenario = with_controller_defaults(args.load(args), *own, source=source)
-    for line in find_unplaced(scenario):
+    scenario = scenario if args.target is None else with_target(scenario, args.target)
+    shown = () if args.image else find_zone_doubts(scenario)  # --image has printed them
+    for line in (*find_unplaced(scenario), *shown):
         warnings.warn(f"{source}: {line}", ScenarioWarning, stacklevel=2)
-    return scenario if args.target is None else with_target(scenario, args.target)
+    return scenario
 
 
 def with_target(scenario: Scenario, target: Sequence[float]) -> Scenario:

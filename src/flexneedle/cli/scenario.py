@@ -104,11 +104,12 @@ def _show(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> int:
     from flexneedle.errors import ScenarioWarning
     from flexneedle.scenario.plausible import find_doubts
+    from flexneedle.simulator.zone_doubts import find_zone_doubts
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ScenarioWarning)
         scenario = _load_complete(args)
-        for line in find_doubts(scenario):
+        for line in [*find_doubts(scenario), *find_zone_doubts(scenario)]:
             warnings.warn(f"{args.scenario}: {line}", ScenarioWarning, stacklevel=1)
     for warning in caught:
         warnings.warn(warning.message, warning.category, stacklevel=1)

@@ -26,11 +26,12 @@ from flexneedle.types import Floats
 
 GROUP = "flexneedle.images"
 """Entry points of readers of images: `distances` maps a `ZoneFile`, the map of its image to the insertion frame and a
-`Workspace` to a `DistanceGrid`, or None where the zone is out of reach."""
+`Workspace` to a `FileZone`."""
 _SMALL_MM = 1e-4  # for slopes of distances
 _BEYOND_MM = 1.0  # beyond margin and allowance, up to which distances are computed
 _STEEP = 0.05  # by which the distance of two contacts may exceed their spacing
-_BESIDE_MM = 10.0  # of the workspace: largest deflection of the needle beyond target and entry
+BESIDE_MM = 10.0
+"""Largest deflection of the needle beyond target and entry, of its workspace."""
 
 
 class Workspace(NamedTuple):
@@ -57,6 +58,33 @@ class DistanceGrid(NamedTuple):
     first: Floats
     spacing: float
     bound: float
+
+
+class ZoneImage(NamedTuple):
+    """An image with zones, a box beyond which zones are unknown.
+
+    name: of its file; center (3,) and half (3,): half the lengths of its edges, mm; axes (3, 3): their
+    directions, rows; notes: what its reader assumed.
+    """
+
+    name: str
+    center: Floats
+    half: Floats
+    axes: Floats
+    notes: tuple[str, ...] = ()
+
+    def beyond(self, points: Floats) -> Floats:
+        """Return the distances (…), mm, of points (…, 3) from the image, 0 inside."""
+        outside = np.maximum(np.abs((points - self.center) @ self.axes.T) - self.half, 0.0)
+        found: Floats = np.linalg.norm(outside, axis=-1)
+        return found
+
+
+class FileZone(NamedTuple):
+    """A zone in a file: its distances, None where it is out of reach, and its image, None for a surface."""
+
+    grid: DistanceGrid | None
+    image: ZoneImage | None
 
 
 class Nearest(NamedTuple):
@@ -86,6 +114,7 @@ class ZoneMap:
         radius: Radius of the needle (mm).
         spacing: Largest distance (mm) between two points of the needle for which clearances are bounds.
         out_of_reach: Names of the zones that the needle cannot reach; distances from them are infinite.
+        images: Images of the zones, each once.
         lost: Of zones whose file cannot be used, by number, the reason; distances from them are infinite.
     """
 
@@ -98,6 +127,7 @@ class ZoneMap:
     radius: float
     spacing: float
     out_of_reach: tuple[str, ...] = ()
+    images: tuple[ZoneImage, ...] = ()
     lost: Mapping[int, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
@@ -216,7 +246,7 @@ def _make_zones(scenario: Scenario, lost: Mapping[int, str]) -> ZoneMap:
     return _zones_of(
         scenario.zone,
         scenario.zones,
-        scenario.image,
+        scenario.image.model_copy(update={"doubts": None}),
         scenario.needle.outer_diameter,
         spacing,
         workspace,
@@ -249,17 +279,18 @@ def _zones_of(
     workspace = Workspace(low, high, far, least + radius)
     lost = dict(without)
     made = [
-        (_NOWHERE, 0.0) if number in lost else _SHAPES[type(zone)](zone, image, workspace)
+        _Made(_NOWHERE) if number in lost else _SHAPES[type(zone)](zone, image, workspace)
         for number, zone in enumerate(zones)
     ]
-    shapes, added = [one for one, _ in made], np.array([always + bound for _, bound in made])
+    shapes, added = [one.shape for one in made], np.array([always + one.bound for one in made])
     packed = kernels.pack(shapes, least + radius + _BEYOND_MM, added + margins - least)
     exact = kernels.Zones(kernels.pack(shapes, np.inf, added).rows, packed.fields, np.inf)
     names = tuple(zone.name for zone in zones)
     away = tuple(
-        name for number, name in enumerate(names) if made[number][0] is _NOWHERE and number not in lost
+        name for number, name in enumerate(names) if made[number].shape is _NOWHERE and number not in lost
     )
-    return ZoneMap(names, least, margins, added, packed, exact, radius, spacing, away, lost)
+    images = tuple({one.image.name: one.image for one in made if one.image}.values())
+    return ZoneMap(names, least, margins, added, packed, exact, radius, spacing, away, images, lost)
 
 
 def target_intrusion(scenario: Scenario) -> str:
@@ -286,7 +317,7 @@ def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[floa
     """Return the corners of what the needle may reach below the skin."""
     entry, setup, depth = scenario.entry, scenario.setup, scenario.setup.max_depth
     steep = abs(entry.slope) + 1e-3 * entry.free_slope_mrad
-    reach = entry.free_radius_mm + steep * depth + setup.max_lateral + _BESIDE_MM
+    reach = entry.free_radius_mm + steep * depth + setup.max_lateral + BESIDE_MM
     low, high = (
         (x, entry.lateral_mm + side * reach, entry.lateral_z_mm + side * reach)
         for x, side in ((0.0, -1.0), (depth, 1.0))
@@ -296,34 +327,41 @@ def workspace_corners(scenario: Scenario) -> tuple[tuple[float, ...], tuple[floa
 
 # ---- shapes, each with a bound (mm) of the error of its distances
 
-_Made = tuple[kernels.Zone, float]
+
+class _Made(NamedTuple):
+    shape: kernels.Zone
+    bound: float = 0.0
+    image: ZoneImage | None = None
+
+
 _NOWHERE = kernels.half_space((-np.inf, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
 def _sphere(zone: sections.Sphere, _image: object, _workspace: object) -> _Made:
-    return kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm), 0.0
+    return _Made(kernels.capsule(zone.center_mm, zone.center_mm, zone.radius_mm))
 
 
 def _capsule(zone: sections.Capsule, _image: object, _workspace: object) -> _Made:
-    return kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm), 0.0
+    return _Made(kernels.capsule(zone.from_mm, zone.to_mm, zone.radius_mm))
 
 
 def _box(zone: sections.Box, _image: object, _workspace: object) -> _Made:
     axes = to_matrix(np.array(zone.rotation)).T
-    return kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes), 0.0
+    return _Made(kernels.box(zone.center_mm, 0.5 * np.array(zone.size_mm), axes))
 
 
 def _half_space(zone: sections.HalfSpace, _image: object, _workspace: object) -> _Made:
-    return kernels.half_space(zone.point_mm, zone.normal), 0.0
+    return _Made(kernels.half_space(zone.point_mm, zone.normal))
 
 
 def _file(zone: sections.ZoneFile, image: sections.ImageSettings, workspace: Workspace) -> _Made:
     reader = load_part("distances", (), GROUP)
     to_needle = Rigid(to_matrix(np.array(image.rotation)), np.array(image.translation_mm))
-    found: DistanceGrid | None = reader(zone, to_needle, workspace)
-    if found is None:
-        return _NOWHERE, 0.0
-    return kernels.grid(found.values, found.first, np.full(3, found.spacing)), found.bound
+    found: FileZone = reader(zone, to_needle, workspace)
+    if found.grid is None:
+        return _Made(_NOWHERE, image=found.image)
+    values, first, spacing, bound = found.grid
+    return _Made(kernels.grid(values, first, np.full(3, spacing)), bound, found.image)
 
 
 _SHAPES: dict[type[sections.Zone], Callable[..., _Made]] = {

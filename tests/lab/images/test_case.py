@@ -18,6 +18,7 @@ from flexneedle.lab.images.example import write_example
 from flexneedle.lab.images.label_map import LabelMap
 from flexneedle.lab.images.markups import read_markups
 from flexneedle.lab.images.volumes import read_label_map, write_label_map
+from flexneedle.lab.page.server.page_session import PageSession
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.simulator.zones import zones_of
 from lab.images.image_cases import ENDS, TEXT, VESSEL, label_map, rename_points, to_ras, write_case
@@ -52,6 +53,7 @@ def test_skin_layers_target_and_zone_of_flat_layers(folder):
     assert scenario.entry.free_radius_mm == 10.0
     assert scenario.image.sd_mm == 0.5
     assert made.doubts[0].startswith("skin: tilted by 0.")
+    assert PageSession.of("case", scenario).describe().doubts == list(made.doubts)
 
 
 def test_the_saved_scenario_is_the_same_and_needs_no_case(folder, tmp_path):
@@ -111,6 +113,23 @@ def test_a_direction_other_than_from_entry_to_target(folder):
     assert (x, math.hypot(y, z)) == pytest.approx((45.0, 5.0), abs=0.3)
 
 
+def test_a_target_outside_of_the_image_is_refused(tmp_path):
+    """45 mm deep along RAS of an image that ends at a depth of 40 mm there."""
+    image = label_map()
+    path = write_case(tmp_path)
+    target = np.linalg.solve(image.affine, [*to_ras([45.0, 0.0, 0.0]), 1.0])[:3]
+    axis = int(np.abs(target - np.array(image.labels.shape[1:]) / 2).argmax())
+    end = int(target[axis]) - 4
+    cut = [slice(None)] * 3
+    cut[axis] = slice(None, end)
+    cropped = LabelMap(image.labels[:, *cut], image.affine, image.segments)
+    write_label_map(cropped, tmp_path / "image.seg.nrrd")
+    with pytest.raises(
+        FileError, match=rf"target = 'target': must be in the label map.* {target[axis] - end + 0.5:.1f} mm"
+    ):
+        import_case(path)
+
+
 def test_an_entry_off_the_skin_is_moved_along_the_insertion(folder):
     made = import_case(write_case(folder, entry=(-3.0, 0.0, 0.0)))
     assert made.scenario.target.depth_mm == pytest.approx(45.0, abs=0.3)
@@ -158,10 +177,12 @@ def test_a_label_map_of_nifti_is_the_same_case(folder, tmp_path):
     text = TEXT.replace("image.seg.nrrd", "image.nii.gz")
     for number, name in enumerate(("fat", "muscle", "liver", "vessel"), 1):
         text = text.replace(f'"{name}"', f'"Segment_{number}"')
-    one = import_case(write_case(tmp_path, text)).scenario
+    made = import_case(write_case(tmp_path, text))
+    one = made.scenario
+    assert "image image.nii.gz: unit not stated, mm assumed" in made.doubts
     other = import_case(write_case(folder)).scenario
     assert one.target == other.target
-    assert one.image == other.image
+    assert one.image.model_copy(update={"doubts": other.image.doubts}) == other.image
     assert one.layer_tops == other.layer_tops
     points = np.random.default_rng(0).uniform([5.0, -20.0, -20.0], [60.0, 20.0, 20.0], (500, 3))
     np.testing.assert_allclose(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trimesh import Trimesh
 from trimesh.creation import capsule, icosphere
 
 from flexneedle.errors import InputError
@@ -13,9 +14,11 @@ from flexneedle.lab.images import distances as made
 from flexneedle.lab.images.distances import distances, error_bound
 from flexneedle.lab.images.label_map import LabelMap, Segment
 from flexneedle.lab.images.meshes import Mesh, write_mesh
+from flexneedle.lab.images.surfaces import find_surface
 from flexneedle.lab.images.volumes import write_label_map
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.sections.zones import ZoneFile
+from flexneedle.simulator.zone_doubts import find_zone_doubts
 from flexneedle.simulator.zones import Workspace, zones_of
 
 NEAR, FAR = 1.5, 4.0
@@ -140,7 +143,7 @@ def test_a_sphere_as_a_label_map_in_the_frame_of_a_file(tmp_path):
     axes = np.indices((80, 80, 60)).reshape(3, -1).T * sizes - [20.0, 30.0, 30.0]
     mask = (np.linalg.norm(axes - centre, axis=1) <= radius).reshape(80, 80, 60)
     label_map = image(mask, sizes, (0.0, 0.0, 0.0), (-20.0, -30.0, -30.0))
-    grid = distances(written(tmp_path, label_map), identity(), WORKSPACE)
+    grid = distances(written(tmp_path, label_map), identity(), WORKSPACE).grid
     points = np.random.default_rng(1).uniform(WORKSPACE.low, WORKSPACE.high, (20_000, 3))
     true = np.linalg.norm(points - centre, axis=1) - radius
     near = np.abs(true) < 3.0
@@ -151,11 +154,11 @@ def test_a_sphere_as_a_label_map_in_the_frame_of_a_file(tmp_path):
 def test_what_is_out_of_reach_has_no_grid_and_what_the_workspace_cuts_goes_on_behind_it(tmp_path):
     mask = np.ones((10, 10, 10), bool)
     far = image(mask, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (100.0, 0.0, 0.0))
-    assert distances(written(tmp_path, far), identity(), WORKSPACE) is None
+    assert distances(written(tmp_path, far), identity(), WORKSPACE).grid is None
     before = image(mask, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (-20.0, 0.0, 0.0))
-    assert distances(written(tmp_path, before), identity(), WORKSPACE) is None
+    assert distances(written(tmp_path, before), identity(), WORKSPACE).grid is None
     across = image(mask, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (10.0, 15.0, 0.0))  # y from 14.5 to 24.5
-    grid = distances(written(tmp_path, across), identity(), WORKSPACE)
+    grid = distances(written(tmp_path, across), identity(), WORKSPACE).grid
     points = np.random.default_rng(2).uniform([10.0, 20.0, 0.0], [19.0, 24.0, 9.0], (500, 3))
     assert (interpolated(grid, points) < 0.5).all()
 
@@ -165,7 +168,7 @@ def test_no_more_than_a_million_cells(tmp_path):
     mask[::59, ::59, ::59] = True
     wide = image(mask, (2.0, 2.0, 2.0), (0.0, 0.0, 0.0), (0.0, -60.0, -60.0))
     workspace = Workspace(np.array([0.0, -60.0, -60.0]), np.array([120.0, 60.0, 60.0]), FAR, NEAR)
-    grid = distances(written(tmp_path, wide), identity(), workspace)
+    grid = distances(written(tmp_path, wide), identity(), workspace).grid
     assert 0.9e6 < np.prod(np.array(grid.values.shape) - 1) <= 1e6
     assert 1.0 < grid.spacing < 1.5
 
@@ -192,13 +195,35 @@ def test_a_closed_surface(tmp_path, shape, true):
     vertices = np.asarray(shape.vertices) - shape.bounds.mean(axis=0)
     turned = Rigid(to_matrix(from_vector(np.ones(3))), np.array([18.0, 1.0, 2.0]))
     write_mesh(Mesh(vertices, np.asarray(shape.faces)), tmp_path / "zone.stl")
-    grid = distances(zone(tmp_path / "zone.stl"), turned, WORKSPACE)
+    grid = distances(zone(tmp_path / "zone.stl"), turned, WORKSPACE).grid
     points = np.random.default_rng(3).uniform(WORKSPACE.low, WORKSPACE.high, (30_000, 3))
     expected = true(turned.inverse().apply(points))
     values = check(grid, expected + 0.02, points)
     near = np.abs(expected) < 3.0
     assert (values - expected)[near].min() > -1.1  # a diagonal of a voxel, and of the grid near a surface
     assert values[expected < -1.0].max() < -0.5
+
+
+def test_a_surface_whose_file_names_no_frame_is_in_the_frame_of_the_zone(tmp_path):
+    ball = icosphere(subdivisions=2, radius=5.0)
+    ball.apply_translation([12.0, 3.0, 0.0])
+    ball.export(tmp_path / "ball.stl")
+    half_turn = Rigid(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    for frame, to_needle in (("RAS", identity()), ("LPS", half_turn)):
+        grid = distances(zone(tmp_path / "ball.stl", frame=frame), to_needle, WORKSPACE).grid
+        assert interpolated(grid, np.array([[12.0, 3.0, 0.0]]))[0] < -3.0
+
+
+def test_a_surface_of_two_blocks_that_touch_at_an_edge_is_closed(tmp_path):
+    """Their common edge has four triangles."""
+    field = np.ones((24, 24, 12))
+    field[4:12, 4:12, 2:10] = field[12:20, 12:20, 2:10] = -1.0
+    surface = find_surface(field, np.array([2.0, -12.0, -6.0]), 1.0)
+    assert not Trimesh(surface.points, surface.triangles).is_watertight
+    write_mesh(surface, tmp_path / "blocks.ply")
+    grid = distances(zone(tmp_path / "blocks.ply"), identity(), WORKSPACE).grid
+    points = np.array([[10.0, -4.0, 0.0], [18.0, 4.0, 0.0], [10.0, 4.0, 0.0], [18.0, -4.0, 0.0]])
+    assert (np.sign(interpolated(grid, points)) == [-1, -1, 1, 1]).all()
 
 
 def test_files_that_cannot_be_used(tmp_path):
@@ -220,6 +245,7 @@ def test_files_that_cannot_be_used(tmp_path):
         (zone(one.file), r"name one with segment \(segments: vessel\)"),
         (zone(tmp_path / "open.stl"), "the surface is not closed"),
         (zone(tmp_path / "open.stl", segment="vessel"), "neither segment nor label"),
+        (zone(one.file, segment="vessel", frame="LPS"), "frame = 'LPS': leave it out: "),
         (zone(tmp_path / "none.seg.nrrd", segment="vessel"), "none.seg.nrrd: cannot be read: No such file"),
     ]
     for each, message in cases:
@@ -244,3 +270,21 @@ def test_a_zone_of_a_scenario(tmp_path):
     assert (found <= 3.5 - radius - always).all()
     assert (found >= 3.5 - radius - always - bound - 0.1).all()
     assert 0.0 < bound < 0.6
+
+
+def test_an_image_that_ends_within_the_reach_of_the_needle(tmp_path):
+    """5 mm beside the straight way, of a reach of 10 mm: a segment of a circle, (θ − sin θ)/2π with θ = 2π/3."""
+    mask = np.zeros((100, 100, 100), bool)
+    mask[60, 30, 50] = True
+    around = image(mask, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (-9.5, -94.5, -49.5))
+    scenario = load_scenario("phantom3d").with_values(
+        {
+            "zone": [written(tmp_path, around).model_dump(exclude_none=True)],
+            "target.depth_mm": 60.0,
+            "target.lateral_mm": 0.0,
+            "target.lateral_z_mm": 0.0,
+        }
+    )
+    (line,) = find_zone_doubts(scenario)
+    assert "ends up to 5.0 mm before the end of the needle's reach, 20 % of which" in line
+    assert find_zone_doubts(scenario.with_values({"entry.lateral_mm": -6.0, "target.lateral_mm": -6.0})) == []

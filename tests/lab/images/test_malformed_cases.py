@@ -155,7 +155,12 @@ PLACES = [
     ({"target": (-20.0, 0.0, 0.0)}, "", "skin: .* % of the lines .* begin inside of the body"),
     ({"entry": (-9.0, 0.0, 0.0)}, "", "entry: is 9.0 mm outside of the skin"),
     ({"entry": (8.0, 0.0, 0.0)}, "", "entry: is 8.* mm below the skin"),
-    ({"entry": (0.0, 90.0, 0.0), "target": (45.0, 90.0, 0.0)}, "", "skin: on .* % of the lines"),
+    ({"entry": (0.0, 81.0, 0.0), "target": (45.0, 81.0, 0.0)}, "", "skin: on .* % of the lines"),
+    (
+        {"target": (45.0, 90.0, 0.0)},
+        "",
+        "target = 'target': must be in the label map, but is 5.6 mm beyond it",
+    ),
     (
         {"target": (30.0, 30.0, 0.0)},
         "",

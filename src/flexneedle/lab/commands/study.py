@@ -186,6 +186,8 @@ def _report(folder: Path, as_json: bool, seconds: float) -> int:
 
 
 def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
+    from flexneedle.lab.study.findings.groups import ENTERED_MM
+
     heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "periods")
     load_heads = ("", "energy (µJ)", "over planned", "over E₁", "stretch", "travel", "rolls")
     varied = [factor.key for factor in found.design.factors if factor.varies]
@@ -195,6 +197,16 @@ def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
     unconverged = sum(group.unconverged_periods for group in found.whole)
     print_table(found.study.title, heads, ((name, *_format_cells(group)) for name, group in rows))
     print("Finished insertions: true error (mm); largest number of periods, relative to the plan.\n")
+    if any(group.has_clearances for _, group in rows):
+        print_table(
+            "Zones",
+            ("", "least clearance", "margin entered"),
+            ((name, *_format_zones(group)) for name, group in rows),
+        )
+        print(
+            f"All insertions: least clearance of the true needle (mm); insertions with one more than {ENTERED_MM:g} mm "
+            "below the least margin.\n"
+        )
     print_table("Load on the tissue", load_heads, ((name, *_format_load(group)) for name, group in rows))
     print(
         f"Over finished insertions: {found.energy_means} of peak, mean and end of the tissue energy; means of each "
@@ -207,6 +219,10 @@ def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
         f"plant {spent['plant_s']:.1f} s, other {spent['rest_s']:.1f} s; wall-clock time {spent['wall_s']:.1f} s"
     )
     print(f"Tables: {found.study.folder}")
+
+
+def _format_zones(group: SettingGroup) -> Sequence[str]:
+    return _number(group.least_clearance_mm), f"{group.entered} of {group.count}"
 
 
 def _label(levels: Mapping[str, str], varied: Sequence[str]) -> str:

@@ -11,8 +11,9 @@ import numpy as np
 from flexneedle.arguments import make_refusal
 from flexneedle.errors import FileError, InputError, ScenarioError
 from flexneedle.geometry.quaternion import from_matrix
+from flexneedle.geometry.rigid import identity
 from flexneedle.lab.images.case_file import ImageCase, LayerChoice, load_case
-from flexneedle.lab.images.distances import check_square, load_label_map
+from flexneedle.lab.images.distances import check_square, find_extent, load_label_map
 from flexneedle.lab.images.frames import ImageRegistration, describe_import
 from flexneedle.lab.images.label_map import LabelMap, Segment
 from flexneedle.lab.images.layers import Layers, find_layers
@@ -24,6 +25,7 @@ from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.library import label
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.zones import REGISTRATION_SDS
+from flexneedle.simulator.zone_doubts import describe_image, find_zone_doubts
 from flexneedle.simulator.zones import zones_of
 from flexneedle.types import Floats
 
@@ -72,6 +74,11 @@ def _import(case: ImageCase, path: Path) -> ImportedCase:
     base, image = load_scenario(case.scenario), load_label_map(Path(case.labels))
     sizes = check_square(image.affine)
     points = _find_points(case)
+    beyond = float(find_extent(Path(case.labels), image, identity()).beyond(points.target))
+    if beyond > 0.0:
+        raise make_refusal(
+            "target", case.target, f"must be in the label map, but is {beyond:.1f} mm beyond it"
+        )
     skin = fit_skin(
         image, _segments(image, "skin", case.skin), points.entry, points.direction, case.skin_radius_mm
     )
@@ -90,7 +97,10 @@ def _import(case: ImageCase, path: Path) -> ImportedCase:
         *describe_import(registration, image.corners).splitlines(),
         *_describe(case, scenario, skin, layers),
     )
-    return ImportedCase(scenario, lines, tuple(_doubts(case, scenario, skin, layers, sampler, image)))
+    extent = find_extent(Path(case.labels), image, skin.to_needle)
+    about_images = dict.fromkeys([*describe_image(extent, scenario), *find_zone_doubts(scenario)])
+    doubts = (*_doubts(case, scenario, skin, layers, sampler, image), *about_images)
+    return ImportedCase(scenario.with_values({"image.doubts": "; ".join(doubts)}), lines, doubts)
 
 
 def _find_points(case: ImageCase) -> _Points:

@@ -18,7 +18,7 @@ from flexneedle.lab.images.meshes import SUFFIXES, read_mesh
 from flexneedle.lab.images.volumes import read_label_map
 from flexneedle.lab.images.voxels import Voxels
 from flexneedle.scenario.sections.zones import ZoneFile
-from flexneedle.simulator.zones import DistanceGrid, Workspace
+from flexneedle.simulator.zones import DistanceGrid, FileZone, Workspace, ZoneImage
 from flexneedle.types import Flags, Floats
 
 _FINEST_MM, _MOST_CELLS = 0.5, 1_000_000  # of the grid; the kernels keep 8 numbers a cell
@@ -45,27 +45,39 @@ class _Box(NamedTuple):
         return _Box(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
 
 
-def distances(zone: ZoneFile, to_needle: Rigid, workspace: Workspace) -> DistanceGrid | None:
-    """Return the distances from a zone in a file, None if it is not near the workspace.
+def distances(zone: ZoneFile, to_needle: Rigid, workspace: Workspace) -> FileZone:
+    """Return the distances from a zone in a file, None if it is not near the workspace, and its image.
 
     to_needle: map from RAS to the needle's frame. Raises InputError, one line, for a file that cannot be used.
     """
     try:
-        return _grid(_read_voxels(zone, to_needle), workspace)
+        voxels, image = _read_voxels(zone, to_needle)
+        return FileZone(_grid(voxels, workspace), image)
     except InputError as error:
         raise InputError(f"zone {zone.name}: {error}") from None
 
 
-def _read_voxels(zone: ZoneFile, to_needle: Rigid) -> Voxels:
-    """Return the voxels of a zone in the needle's frame."""
+def _read_voxels(zone: ZoneFile, to_needle: Rigid) -> tuple[Voxels, ZoneImage | None]:
+    """Return the voxels of a zone in the needle's frame, and its image."""
     path = Path(zone.file)
     if path.name.lower().endswith(SUFFIXES):
         if zone.segment is not None or zone.label is not None:
             raise InputError(f"{path}: a surface has neither segment nor label: leave them out")
-        return voxelise(path, read_mesh(path), to_needle)
+        return voxelise(path, read_mesh(path, zone.frame), to_needle), None
+    if zone.frame is not None:
+        raise make_refusal("frame", zone.frame, f"leave it out: {path} names its frame itself")
     image = load_label_map(path)
     found = _choose_segment(image, zone, path)
-    return Voxels(image.labels[found.layer], found.label, matrix(to_needle) @ image.affine)
+    voxels = Voxels(image.labels[found.layer], found.label, matrix(to_needle) @ image.affine)
+    return voxels, find_extent(path, image, to_needle)
+
+
+def find_extent(path: Path, image: LabelMap, to_needle: Rigid) -> ZoneImage:
+    """Return the box of an image in the needle's frame. Raises InputError if its axes are not perpendicular."""
+    sizes, corners = check_square(image.affine), to_needle.apply(image.corners)
+    axes = (to_needle.rotation @ image.affine[:3, :3] / sizes).T
+    half = 0.5 * sizes * image.labels.shape[1:]
+    return ZoneImage(path.name, corners.mean(axis=0), half, axes, image.notes)
 
 
 def load_label_map(path: Path) -> LabelMap:

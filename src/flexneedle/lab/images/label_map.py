@@ -29,13 +29,15 @@ class LabelMap:
     """Labels of voxels, and named segments.
 
     labels: whole numbers, 0 is background, (layers, i, j, k): segments of different layers may overlap; affine: map
-    (4, 4) from voxels i, j, k to RAS (mm), integers at the centres of voxels. Raises InputError for labels that are
-    not whole numbers from 0 to 2³¹ − 1, an affine without inverse, a segment in no layer, or two with one label.
+    (4, 4) from voxels i, j, k to RAS (mm), integers at the centres of voxels; notes: what a reader assumed.
+    Raises InputError for labels that are not whole numbers from 0 to 2³¹ − 1, an affine without inverse, a segment in
+    no layer, or two with one label.
     """
 
     labels: NDArray[Any]
     affine: Floats
     segments: tuple[Segment, ...]
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", _check_labels(np.asarray(self.labels)))

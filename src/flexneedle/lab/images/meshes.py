@@ -94,7 +94,9 @@ def _choose_frame(comment: str, given: str | None) -> str:
     if given is not None:
         named.add(check_frame("frame", given))
     if not named:
-        raise InputError("has no comment SPACE=LPS or SPACE=RAS: name the frame, LPS or RAS")
+        raise InputError(
+            "has no comment SPACE=LPS or SPACE=RAS: name the frame, LPS or RAS, by the key frame"
+        )
     if len(named) > 1:
         raise InputError("has two frames, LPS and RAS, in its comments or as argument: must be one")
     return named.pop()

@@ -28,7 +28,8 @@ def read_nifti(path: Path) -> LabelMap:
         raise make_refusal("dim", shape, "must be three axes")
     affine = _read_affine(image, shape[:3])
     labels = np.asanyarray(image.dataobj).reshape((1, *shape[:3]))
-    return with_named_labels(LabelMap(labels, affine, ()))
+    notes = () if unit == "mm" else ("unit not stated, mm assumed",)
+    return with_named_labels(LabelMap(labels, affine, (), notes))
 
 
 def encode_nifti(image: LabelMap, *, zipped: bool) -> bytes:

@@ -89,7 +89,8 @@ class SessionMessage(ServerMessage):
         revision: Number of changes; a scene, plan or estimate repeats its revision.
         reach_since: First revision with the reach of this one: later ones differ in target and controller only.
         changed: Keys that differ from the preset or file.
-        doubts: Values that are valid but implausible, and files of zones that cannot be used.
+        doubts: Values that are valid but implausible, files of zones that cannot be used, and what the image has
+            outside of the model's assumptions.
         undoes, redoes: Whether a change can be undone, and redone.
         targets: Named targets; `target` is the name of the scenario's.
     """

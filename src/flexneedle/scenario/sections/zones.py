@@ -36,6 +36,13 @@ class ImageSettings(Section):
     """Position x, y, z of the image's origin in the insertion frame."""
     sd_mm: NonNegative = 0.0
     """Standard deviation of a mapped point on each axis. Twice this value is added to the margin of each zone."""
+    doubts: Annotated[str, AfterValidator(one_line)] | None = None
+    """Lines of `flexneedle image check` about what is outside of the model's assumptions, separated by `; `."""
+
+    @property
+    def doubt_lines(self) -> list[str]:
+        """Lines of `doubts`."""
+        return self.doubts.split("; ") if self.doubts else []
 
 
 class ZoneSettings(Section):
@@ -111,6 +118,8 @@ class ZoneFile(Zone):
     """Name of the segment. Not set: `label`; a mesh has neither."""
     label: Annotated[int, Field(ge=1, le=2**31 - 1)] | None = None
     """Label of the voxels, in the first layer of the file."""
+    frame: Literal["LPS", "RAS"] | None = None
+    """Frame of a mesh whose comment does not name it."""
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
     """SHA-256 of the file, added when the scenario is loaded. A file that has changed since then is refused."""
 

@@ -85,6 +85,21 @@ def test_unfinished_insertions_are_counted_and_not_averaged(read):
     assert (group.finished, group.known) == (3, 1)
 
 
+def test_margins_entered_are_counted_by_the_least_margin_of_the_zones_of_each_row(read):
+    """Of 2 mm in common and 1.5 mm of one zone; the third row has a margin of 3 mm, the fifth no zone."""
+    rows = make_rows(targets=TARGETS[:1], repeats=5)
+    zones = {"zone.0.shape": "sphere", "zone.1.shape": "box", "zone.1.margin_mm": 1.5, "zones.margin_mm": 2.0}
+    third = {"zone.0.shape": "sphere", "zones.margin_mm": 3.0}
+    for row, clearance, more in zip(
+        rows, (1.39, 1.41, 2.8, 0.7, None), (zones, zones, third, zones, {}), strict=True
+    ):
+        row |= more | {"true_clearance_mm": clearance}
+    rows[3] = unfinished(rows[3])
+    study = read(rows)
+    (group,) = group_rows(study.rows, [find_design(study).controller])
+    assert (group.least_clearance_mm, group.entered) == (0.7, 3)
+
+
 def of_both(repeats, targets=TARGETS):
     """Rows of the open loop and of the default, and the latter's errors by seed."""
     rows = make_rows(("open-loop", OURS), targets=targets, repeats=repeats)

@@ -210,6 +210,16 @@ def test_effort_is_reported_relative_to_the_plan(report_on):
     assert report.values()["groups"][0]["unconverged_periods"] == 7
 
 
+def test_clearances_are_in_the_table_of_a_study_with_zones_alone(report_on):
+    rows = make_rows(targets=TARGETS, repeats=4)
+    zone = {"zone.0.shape": "sphere", "zones.margin_mm": 2.0, "true_clearance_mm": 2.25}
+    for each, shown in ((rows, False), ([row | zone for row in rows], True)):
+        page = report_on(each)[1]
+        headings = [heading for table in page.tables.values() for heading in table.headings]
+        assert ("least clearance (mm)" in headings) == ("margin entered" in headings) == shown
+        assert ("2.250 mm margin entered by 0 insertions" in page.text) == shown
+
+
 def test_a_study_of_an_earlier_version_has_the_energy_at_the_end_alone(report_on):
     """The columns of peak, mean, scale and stretch are missing, not the report."""
     new = re.compile("energy_uj|energy_scale|least_stretch|planned_guide")

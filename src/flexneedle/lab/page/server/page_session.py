@@ -144,7 +144,7 @@ class PageSession:
             name=self.name,
             values=values,
             changed=[key for key in before | values if before.get(key) != values.get(key)],
-            doubts=[*self.notes, *find_doubts(self.scenario)],
+            doubts=[*self.notes, *find_doubts(self.scenario), *self.scenario.image.doubt_lines],
             seed=self.seed,
             strategy=self.strategy,
             controller=self.controller,

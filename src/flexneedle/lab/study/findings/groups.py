@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, takewhile
 from math import isnan, nan
 
 import numpy as np
@@ -25,6 +25,7 @@ from flexneedle.lab.study.findings.statistics import (
 DONE = "done"
 ENERGIES = ("peak", "mean", "end")
 HIT_MM = 1.0  # radius of the paper's target circles
+ENTERED_MM = 0.1  # by which a margin is entered, as in the warning of an insertion
 _MOST_DEPTHS, _DEPTH_BANDS = 8, 5
 _NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
@@ -37,8 +38,10 @@ class SettingGroup:
     insertions with a known true error; missed: those that ended more than 1 mm from the target; unconverged: insertions
     with a period that did not converge, finished or not; unconverged_periods: number of such periods; seeds: number of
     distinct seeds; largest_mm: largest true error; largest_period_ratio: largest number of periods relative to the
-    plan; beyond_largest: upper bound (95 % confidence) on the share of all insertions beyond largest_mm; estimates: by
-    name, over finished insertions; energies of random worlds are geometric means.
+    plan; least_clearance_mm: of the true needle from the zones, finished or not, NaN without zones; entered:
+    insertions, finished or not, with a clearance below the least margin by more than ENTERED_MM; beyond_largest: upper
+    bound (95 % confidence) on the share of all insertions beyond largest_mm; estimates: by name, over finished
+    insertions; energies of random worlds are geometric means.
     """
 
     name: str
@@ -52,8 +55,15 @@ class SettingGroup:
     seeds: int
     largest_mm: float
     largest_period_ratio: float
+    least_clearance_mm: float
+    entered: int
     beyond_largest: float
     estimates: dict[str, IntervalEstimate]
+
+    @property
+    def has_clearances(self) -> bool:
+        """Whether a clearance from a zone to avoid is known."""
+        return not isnan(self.least_clearance_mm)
 
 
 @dataclass(frozen=True)
@@ -120,6 +130,8 @@ def _make_group(
     known = error[~np.isnan(error)]
     seeds = rows.codes("seed")[ended]
     unconverged = np.nan_to_num(rows.number("unconverged_periods")[members])
+    clearance = rows.number("true_clearance_mm")[members]
+    known_clearances = clearance[np.isfinite(clearance)]
     ratios = divide_positive(rows.number("periods")[ended], rows.number("planned_periods")[ended])
     return SettingGroup(
         name=name,
@@ -133,9 +145,21 @@ def _make_group(
         seeds=len(np.unique(seeds)),
         largest_mm=_find_largest(known),
         largest_period_ratio=_find_largest(ratios[~np.isnan(ratios)]),
+        least_clearance_mm=float(known_clearances.min()) if len(known_clearances) else nan,
+        entered=int((clearance < _find_margins(rows)[members] - ENTERED_MM).sum()),
         beyond_largest=bound_share_beyond(len(known)),
         estimates=_estimate_group(rows, ended, seeds),
     )
+
+
+def _find_margins(rows: InsertionRows) -> Floats:
+    """Return the least margin (n,), mm, of the zones of each row, NaN without zones."""
+    margins, common = np.full(len(rows), nan), rows.number("zones.margin_mm")
+    for start in takewhile(lambda start: f"{start}.shape" in rows.names, map("zone.{}".format, count())):
+        own = rows.number(f"{start}.margin_mm")
+        is_used = np.array(rows.text(f"{start}.shape")) != ""
+        margins = np.fmin(margins, np.where(is_used, np.where(np.isnan(own), common, own), nan))
+    return margins
 
 
 def _estimate_group(rows: InsertionRows, ended: Codes, seeds: Codes) -> dict[str, IntervalEstimate]:
