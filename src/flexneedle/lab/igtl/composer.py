@@ -51,8 +51,9 @@ class IgtlComposer:
     _seen_at: float = field(default=0.0, init=False)  # when the period arrived
     _seen_age: float = field(default=0.0, init=False)  # age of the reading then
 
-    def begin(self) -> None:
-        """Forget the needle of the last insertion: its readings are no longer new."""
+    def begin(self, registration: ImageRegistration | None) -> None:
+        """Begin an insertion: the readings of the last one are no longer new."""
+        self.registration = registration
         self._plan = self._period = self._read_at = None
 
     def compose(self, record: object, now: float) -> Iterator[Message]:
@@ -71,13 +72,6 @@ class IgtlComposer:
                 yield self.make_status(now)
             case InsertionResult(time, text):
                 yield self._make_string(time, text)
-
-    def recompose(self) -> Iterator[Message]:
-        """Yield the geometry again, after a change of the registration."""
-        if self._plan is not None:
-            yield from self._make_path(self._plan)
-        if self._period is not None:
-            yield from self._make_geometry(self._period)
 
     def make_status(self, now: float) -> StatusMessage:
         """Return state, age of the newest accepted reading and frame, at a time (s) of this process."""
