@@ -44,7 +44,7 @@ class Skipped:
     reason: str
 
 
-PeerGeometry = Message | Query | Skipped
+Received = Message | Query | Skipped
 
 
 def pack(message: Message, version: int = 1) -> bytes:
@@ -118,9 +118,9 @@ class Decoder:
         self.version, self.refused = 1, ""
         self._data, self._skip = bytearray(), 0
 
-    def feed(self, data: bytes | bytearray) -> list[PeerGeometry]:
+    def feed(self, data: bytes | bytearray) -> list[Received]:
         """Return the messages that are complete with these bytes."""
-        found: list[PeerGeometry] = []
+        found: list[Received] = []
         if self.refused:
             return found
         self._data += data
@@ -132,7 +132,7 @@ class Decoder:
             self._data.clear()
         return found
 
-    def _next(self) -> PeerGeometry | None:
+    def _next(self) -> Received | None:
         skip = min(self._skip, len(self._data))
         del self._data[:skip]
         self._skip -= skip
@@ -157,7 +157,7 @@ class Decoder:
         self.version = max(self.version, min(version, 2))
         return header
 
-    def _read_body(self, header: _Header) -> PeerGeometry | None:
+    def _read_body(self, header: _Header) -> Received | None:
         end = _HEADER.size + header.size
         if len(self._data) < end:
             return None

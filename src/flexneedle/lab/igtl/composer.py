@@ -36,7 +36,7 @@ _LONGEST_NAME = 20  # bytes
 
 @dataclass
 class IgtlComposer:
-    """Makes messages; keeps the last plan, period and state.
+    """Makes messages; keeps the last plan and state.
 
     epoch: Unix time (s) of the records' time 0; registration: of the image, None if it is not known.
     """
@@ -44,7 +44,6 @@ class IgtlComposer:
     epoch: float = 0.0
     registration: ImageRegistration | None = None
     _plan: Plan | None = field(default=None, init=False)
-    _period: Period | None = field(default=None, init=False)
     _state: LinkState = field(default=LinkState(0.0, "idle"), init=False)
     _ahead: float | None = field(default=None, init=False)  # of the records' time before this process's
     _read_at: float | None = field(default=None, init=False)  # time of the newest accepted reading
@@ -54,7 +53,7 @@ class IgtlComposer:
     def begin(self, registration: ImageRegistration | None) -> None:
         """Begin an insertion: the readings of the last one are no longer new."""
         self.registration = registration
-        self._plan = self._period = self._read_at = None
+        self._plan = self._read_at = None
 
     def compose(self, record: object, now: float) -> Iterator[Message]:
         """Yield the messages of a record, at a time (s) of this process; none for a record of another kind."""
@@ -99,7 +98,6 @@ class IgtlComposer:
         return max(0.0, self.epoch + time)
 
     def _keep(self, period: Period, now: float) -> None:
-        self._period = period
         if period.verdict.ok:
             self._read_at = period.measurement.time
         if self._read_at is not None:

@@ -1,4 +1,4 @@
-"""PeerGeometry registrations, targets and entries as values of a scenario, with checks: one registration for everything."""
+"""Received registrations, targets and entries as values of a scenario: one registration for everything."""
 
 import math
 from collections.abc import Iterator
