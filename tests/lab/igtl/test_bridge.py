@@ -102,10 +102,10 @@ def test_a_stop_of_a_peer_stops_the_rig_or_the_next_event(port, with_rig):
     assert len(rig.stops) == with_rig
 
 
-def awaited(bridge, scenario):
+def awaited(bridge):
     """A thread that waits for a target, and a list for the scenario with it."""
     found = []
-    waiting = Thread(target=lambda: found.append(bridge.await_target(scenario)))
+    waiting = Thread(target=lambda: found.append(bridge.await_target()))
     waiting.start()
     until(lambda: listed(bridge) and bridge._awaited)
     return waiting, found
@@ -113,7 +113,7 @@ def awaited(bridge, scenario):
 
 def test_a_target_waits_for_points_by_the_registration_of_the_peer(port):
     with opened(port, scenario=SPACE, awaits=True) as bridge, connected(port) as peer:
-        waiting, found = awaited(bridge, SPACE)
+        waiting, found = awaited(bridge)
         peer.send_registration(np.array(MATRIX))
         peer.send_points(Lesion=(1.0, 1.0, 1.0))
         peer.send_points(Target=(900.0, -28.5, 7.0))  # out of reach
@@ -134,7 +134,7 @@ def test_a_target_waits_for_points_by_the_registration_of_the_peer(port):
 def test_another_registration_than_the_scenarios_is_refused_in_one_line(port):
     shifted = np.array(MATRIX) + np.eye(4, k=3) * 9.0  # 9 mm along x
     with opened(port, scenario=IN_IMAGE, awaits=True) as bridge, connected(port) as peer:
-        waiting, found = awaited(bridge, IN_IMAGE)
+        waiting, found = awaited(bridge)
         peer.send_registration(shifted)
         peer.send_points(Target=(1.0, -28.5, -23.0))
         waiting.join(DEADLINE_S)

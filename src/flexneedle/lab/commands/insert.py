@@ -95,7 +95,7 @@ class LinkedConnection(Connection):
         if self._ros_bridge is not None and ros is not None and ros.target:
             return with_target(scenario, self._ros_bridge.await_target())
         if self._igtl_bridge is not None and self.args.igtl_target:
-            return self._igtl_bridge.await_target(scenario)
+            return self._igtl_bridge.await_target()
         return scenario
 
     def _check_targets(self, ros: RosSettings | None) -> None:

@@ -50,15 +50,15 @@ class IgtlBridge(LinkBridge):
         self.settings = settings
         self._on_stop: Callable[[str], None] = _ignore
         self._scenario, self._awaits, self._forward = scenario, awaits, forward
+        self._placed: Scenario  # with the target that was awaited
         self._over = forward is not None
         registration = None if scenario is None else registration_of(scenario)
 
         def open_node(epoch: float) -> LinkClient:
-            return LinkClient(f"{__package__}.node", NodeSetup(settings, epoch, registration), self.protocol)
+            setup = NodeSetup(settings, epoch, registration, awaits or self._over)
+            return LinkClient(f"{__package__}.node", setup, self.protocol)
 
         super().__init__(open_node, self._first_record, show)
-        if forward is not None:
-            self._node.publish(TargetWait())
 
     @property
     def _first_record(self) -> dict[str, str]:
@@ -104,16 +104,14 @@ class IgtlBridge(LinkBridge):
         self._node.publish(InsertionResult(self._now(), text))
         self._change_state(_ENDED, text)
 
-    def await_target(self, scenario: Scenario) -> Scenario:
+    def await_target(self) -> Scenario:
         """Wait for a target, and an entry before it or with it; return the scenario with them and the registration.
 
         Raises StoppedError after a stop, RunError without the node.
         """
-        self._scenario = scenario
-        self._node.publish(TargetWait())
         self._await_target("a target of a peer")
-        self._node.publish(InsertionBegin(registration_of(self._scenario)))
-        return self._scenario
+        self._node.publish(InsertionBegin(registration_of(self._placed)))
+        return self._placed
 
     def __call__(self, event: Event) -> None:
         """Publish an event. After a stop, raises StoppedError at each event in the insertion's thread."""
@@ -154,7 +152,8 @@ class IgtlBridge(LinkBridge):
         for line in placed.lines:
             self._note_others(f"{received.source}: {line}")
         if received.target is not None:
-            self._scenario, self._awaits = scenario, False
+            self._scenario = self._placed = scenario
+            self._awaits = False
             self._target = LinkTarget(self._now(), scenario.target.position)
 
     def _is_comparable(self, received: PeerGeometry) -> bool:

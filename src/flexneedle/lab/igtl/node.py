@@ -36,7 +36,7 @@ class IgtlNode:
     def __init__(self, setup: NodeSetup, channel: MessageChannel) -> None:
         self._settings, self._channel = setup.settings, channel
         self._composer = IgtlComposer(setup.epoch, setup.registration)
-        self._awaits_target = False
+        self._awaits_target = setup.awaits
         self._registration: ImageRegistration | None = None  # the one received last
         self._entry: Point | None = None
         self._refused, self._refused_at = 0, -BEAT_S

@@ -9,11 +9,15 @@ from flexneedle.types import Point
 
 @dataclass(frozen=True)
 class NodeSetup:
-    """The first record to a node. epoch: Unix time (s) of the records' time 0; registration: of the image, if known."""
+    """The first record to a node.
+
+    epoch: Unix time (s) of the records' time 0; registration: of the image, if known; awaits: as after `TargetWait`.
+    """
 
     settings: IgtlSettings
     epoch: float
     registration: ImageRegistration | None = None
+    awaits: bool = False
 
 
 @dataclass(frozen=True)
