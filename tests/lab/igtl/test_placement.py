@@ -40,7 +40,7 @@ def unplaced(case):
 
 
 def sent_path(registration=None):
-    """What a peer sends: target and entry of 32 bits, in RAS."""
+    """Target and entry of 32 bits, in RAS, as a peer sends them."""
     target, entry = (
         tuple(np.float32(to_ras(at)).astype(float).tolist()) for at in ((44.0, 2.0, 1.0), (0.5, 1.0, -2.0))
     )

@@ -1,4 +1,4 @@
-"""What peers of OpenIGTLink send between insertions edits the scenario of the page."""
+"""Edits of the page's scenario by peers of OpenIGTLink, between insertions."""
 
 import math
 

@@ -117,7 +117,7 @@ def _check_entry(entry: Point, radius: float) -> None:
 def _doubts(entry: Point, target: Point, *, has_image: bool) -> Iterator[str]:
     """Yield what the import of an image checks for its own points, and what is left of a received entry."""
     (depth, *off), (at, *way) = entry, target
-    if abs(depth) > _ROUNDING_MM:
+    if abs(depth) > SAME_MM:
         yield f"entry: {abs(depth):.2g} mm {'below' if depth > 0.0 else 'above'} the skin, taken on it"
     if has_image:
         angle = math.degrees(math.atan2(math.dist(off, way), at))

@@ -30,7 +30,7 @@ class ReceivedEdits:
         return session if edited.has_content_of(session) else edited, frozenset(placed.values)
 
     def _print(self, *lines: str) -> None:
-        """Print lines, unless they are those of the last call: a peer may repeat a message."""
+        """Print lines, unless the last call printed the same: a peer may repeat a message."""
         text = "".join(f"flexneedle: {line}\n" for line in lines)
         if text != self._printed:
             self._printed = text
