@@ -122,7 +122,7 @@ def _doubts(entry: Point, target: Point, *, has_image: bool) -> Iterator[str]:
     if has_image:
         angle = math.degrees(math.atan2(math.dist(off, way), at))
         yield (
-            f"outside of the model's assumptions: skin and layers are those of the axis, {math.hypot(*off):.1f} mm "
+            f"outside of the model's assumptions: skin and layers are of the axis, {math.hypot(*off):.1f} mm "
             f"from the entry, at an angle of {angle:.1f} degrees to the line from entry to target; not fitted again"
         )
 

@@ -1,4 +1,4 @@
-"""Records that an insertion and its OpenIGTLink node exchange, besides `Plan`, `Period` and those of `lab.link`."""
+"""Records that an insertion and its OpenIGTLink node exchange, besides `Plan`, `Period` and records of `lab.link`."""
 
 from dataclasses import dataclass
 
@@ -42,7 +42,7 @@ class InsertionResult:
 
 @dataclass(frozen=True)
 class PeerGeometry:
-    """What a peer has sent: a registration, or a target by it.
+    """A registration of a peer, or a target by it.
 
     Attributes:
         source: The peer.
