@@ -28,6 +28,9 @@ from synthetic import make_periods, make_plan
 
 PLAN = make_plan()
 PERIODS = list(make_periods(PLAN))
+SPACE = flexneedle.load_scenario("phantom3d")
+IMAGE = ImageRegistration.of_matrix(MATRIX)
+IN_IMAGE = SPACE.with_values({"image.rotation": IMAGE.rotation, "image.translation_mm": IMAGE.translation})
 
 
 class Rig:
@@ -65,7 +68,7 @@ def await_peer(bridge, peer):
 
 
 def test_a_peer_receives_an_insertion(port):
-    with opened(port, registration=ImageRegistration.of_matrix(MATRIX)) as bridge, connected(port) as peer:
+    with opened(port, scenario=IN_IMAGE) as bridge, connected(port) as peer:
         await_peer(bridge, peer)
         bridge(Iterated("manipulation", {}))
         bridge(Planned(PLAN))
@@ -99,40 +102,81 @@ def test_a_stop_of_a_peer_stops_the_rig_or_the_next_event(port, with_rig):
     assert len(rig.stops) == with_rig
 
 
-def test_a_target_waits_for_points_by_the_registration_of_the_peer(port):
+def awaited(bridge):
+    """A thread that waits for a target, and a list for the scenario with it."""
     found = []
-    with opened(port) as bridge, connected(port) as peer:
-        waiting = Thread(target=lambda: found.append(bridge.await_target()))
-        waiting.start()
-        until(lambda: listed(bridge) and bridge._awaited)
+    waiting = Thread(target=lambda: found.append(bridge.await_target()))
+    waiting.start()
+    until(lambda: listed(bridge) and bridge._awaited)
+    return waiting, found
+
+
+def test_a_target_waits_for_points_by_the_registration_of_the_peer(port):
+    with opened(port, scenario=SPACE, awaits=True) as bridge, connected(port) as peer:
+        waiting, found = awaited(bridge)
         peer.send_registration(np.array(MATRIX))
         peer.send_points(Lesion=(1.0, 1.0, 1.0))
-        peer.send_points(**{"Entry-1": (1.0, 1.5, 7.0), "Target-1": (1.0, -28.5, 7.0)})
+        peer.send_points(Target=(900.0, -28.5, 7.0))  # out of reach
+        peer.send_points(**{"Entry-1": (1.0, 1.5, -23.0), "Target-1": (1.0, -28.5, -23.0)})
         waiting.join(DEADLINE_S)
-    (target,) = found
-    assert (target.point, target.entry) == ((30.0, -1.25, 37.0), (0.0, -1.25, 37.0))
+        peer.send_registration(np.eye(4))
+        until(lambda: any("differs from [image]" in one for one in listed(bridge)))
+    (scenario,) = found
+    assert scenario.target.position == pytest.approx((30.0, -1.25, 7.0), abs=1e-9)
+    assert (scenario.entry.lateral_mm, scenario.entry.lateral_z_mm) == pytest.approx((-1.25, 7.0), abs=1e-9)
+    assert scenario.image == IN_IMAGE.image
     events = listed(bridge)
-    assert "target 30, -1.25, 37 mm, entry 0, -1.25, 37 mm" in events
+    assert any(one.endswith(": target 30, -1.25, 7 mm, entry 0, -1.25, 7 mm") for one in events)
     assert any("no point is named Target or Entry" in one for one in events)
+    assert any("refused: target.lateral_mm = 897.75" in one for one in events)
+
+
+def test_another_registration_than_the_scenarios_is_refused_in_one_line(port):
+    shifted = np.array(MATRIX) + np.eye(4, k=3) * 9.0  # 9 mm along x
+    with opened(port, scenario=IN_IMAGE, awaits=True) as bridge, connected(port) as peer:
+        waiting, found = awaited(bridge)
+        peer.send_registration(shifted)
+        peer.send_points(Target=(1.0, -28.5, -23.0))
+        waiting.join(DEADLINE_S)
+    assert found[0].target.position == pytest.approx((30.0, -1.25, 7.0), abs=1e-9)
+    assert found[0].image == IN_IMAGE.image
+    (refusal,) = [one for one in listed(bridge) if "differs" in one]
+    assert "refused: registration of the image: differs from [image] of the scenario by up to 9 mm" in refusal
+
+
+def test_a_registration_that_is_not_awaited_is_refused(port):
+    with opened(port, scenario=SPACE) as bridge, connected(port) as peer:
+        peer.send_registration(np.array(MATRIX))
+        until(lambda: any("registration of the image: not awaited" in one for one in listed(bridge)))
 
 
 def test_a_connection_stays_open_for_further_insertions(port):
-    stops = []
-    with opened(port) as bridge, connected(port) as peer:
+    stops, received = [], []
+    with opened(port, forward=received.append) as bridge, connected(port) as peer:
+
+        def ignored(number):
+            return sum("ignored, there is no insertion" in one for one in listed(bridge)) == number
+
         peer.send_stop()
-        until(lambda: bridge._stopped)
-        with bridge.insertion(on_stop=stops.append):
+        until(lambda: ignored(1))
+        peer.send_points(Target=(30.0, 1.0, 0.0))
+        until(lambda: received)
+        with bridge.insertion(SPACE, on_stop=stops.append):
             bridge(PeriodEnded(PERIODS[0]))
+            peer.send_points(Target=(31.0, 1.0, 0.0))
             peer.send_stop()
             until(lambda: stops)
+            assert any("ignored, no target is awaited" in one for one in listed(bridge))
         peer.send_stop()
-        until(lambda: any("ignored, there is no insertion" in one for one in listed(bridge)))
-        with bridge.insertion():
+        peer.send_points(Target=(32.0, 1.0, 0.0))
+        until(lambda: ignored(1) and len(received) > 1)
+        with bridge.insertion(SPACE):
             bridge(PeriodEnded(PERIODS[0]))
-            with pytest.raises(RunError), bridge.insertion():
+            with pytest.raises(RunError), bridge.insertion(SPACE):
                 raise RunError("refused")
         until(lambda: peer.last("NeedleError").string == "refused")
     assert len(stops) == 1
+    assert [one.target for one in received] == [(30.0, 1.0, 0.0), (32.0, 1.0, 0.0)]
 
 
 def test_a_peer_that_reads_nothing_delays_neither_the_insertion_nor_another_peer(port):

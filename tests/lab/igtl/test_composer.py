@@ -79,7 +79,7 @@ def test_the_age_of_the_newest_accepted_reading_grows_while_nothing_is_published
     assert made.make_status(12.0).subcode == 2050
     later = replace(PERIOD, time=PERIOD.time + 0.2, verdict=Verdict(VerdictKind.STALE, "old"))
     assert list(made.compose(later, 12.0))[-1].subcode == 250  # its reading was rejected
-    made.begin()
+    made.begin(None)
     assert made.make_status(13.0).subcode == -1
 
 
@@ -104,10 +104,10 @@ def test_the_error_is_the_distance_to_the_target_and_at_the_end_the_result():
     assert found["NeedleError"].text == "reached"
 
 
-def test_a_new_registration_moves_what_is_shown():
+def test_the_registration_of_an_insertion_moves_what_is_shown():
     made, before = composed(PLAN, PERIOD)
-    made.registration = IMAGE
-    after = {message.name: message for message in made.recompose()}
+    made.begin(IMAGE)
+    after = {message.name: message for record in (PLAN, PERIOD) for message in made.compose(record, 0.0)}
     assert {"NeedlePath", "Needle", "NeedlePoints", "NeedleTip"} <= set(after)
     np.testing.assert_allclose(
         homogeneous(np.array(after["Needle"].points)) @ np.array(MATRIX).T,

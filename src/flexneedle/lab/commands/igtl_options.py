@@ -43,7 +43,13 @@ def igtl_settings(args: argparse.Namespace) -> IgtlSettings | None:
     """Return the settings of the arguments, None without --igtl."""
     from flexneedle.lab.igtl.settings import IgtlSettings
 
-    return None if args.igtl is None else IgtlSettings(args.igtl, args.igtl_registration)
+    if args.igtl is None:
+        return None
+    if args.image is None:
+        return IgtlSettings(args.igtl, args.igtl_registration)
+    from flexneedle.lab.images.case_file import load_case
+
+    return IgtlSettings(args.igtl, args.igtl_registration, load_case(args.image).skin_radius_mm)
 
 
 def _address(text: str) -> IgtlAddress:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
     from flexneedle.lab.igtl.bridge import IgtlBridge
     from flexneedle.lab.link.bridge import LinkBridge
-    from flexneedle.lab.link.records import LinkTarget
     from flexneedle.lab.rig.rig_file import RigFile, RosSettings
     from flexneedle.lab.ros.bridge import Bridge
     from flexneedle.planning.events import Listener
@@ -90,14 +89,13 @@ class LinkedConnection(Connection):
             self._ros_bridge = stack.enter_context(Bridge(ros, print_line))
         if igtl is not None:
             from flexneedle.lab.igtl.bridge import IgtlBridge
-            from flexneedle.lab.images.frames import registration_of
 
-            bridge = IgtlBridge(igtl, print_line, registration_of(scenario))
+            bridge = IgtlBridge(igtl, print_line, scenario, awaits=self.args.igtl_target)
             self._igtl_bridge = stack.enter_context(bridge)
         if self._ros_bridge is not None and ros is not None and ros.target:
             return with_target(scenario, self._ros_bridge.await_target())
         if self._igtl_bridge is not None and self.args.igtl_target:
-            return with_path(scenario, self._igtl_bridge.await_target())
+            return self._igtl_bridge.await_target()
         return scenario
 
     def _check_targets(self, ros: RosSettings | None) -> None:
@@ -128,14 +126,6 @@ class LinkedConnection(Connection):
     def gate(self, progress: Progress, scenario: Scenario) -> Gate | None:
         """Return the gates of the connections."""
         return AllGates(*self._bridges.values())
-
-
-def with_path(scenario: Scenario, path: LinkTarget) -> Scenario:
-    """Return the scenario with target, and entry if there is one. Raises ScenarioError for one out of reach."""
-    if path.entry is not None:
-        _, y, z = path.entry
-        scenario = scenario.with_values({"entry.lateral_mm": y, "entry.lateral_z_mm": z})
-    return with_target(scenario, path.point)
 
 
 class RigConnection(LinkedConnection):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from functools import partial
@@ -111,7 +112,10 @@ def _setup(args: argparse.Namespace) -> PageSetup:
         igtl.address.require_free()
     link = () if igtl is None else (str(igtl.address), igtl.registration)
     workers = (_WORKER, plans), (_WORKER, "insertion", *link)
-    return PageSetup(session, args.runs, PageLimits() if rig is None else RIG_LIMITS, workers, rig)
+    limits = PageLimits() if rig is None else RIG_LIMITS
+    return PageSetup(
+        session, args.runs, limits, workers, rig, math.inf if igtl is None else igtl.entry_radius
+    )
 
 
 def _load_rig(source: str) -> RigReference:

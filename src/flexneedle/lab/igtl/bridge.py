@@ -2,16 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from flexneedle.errors import FlexneedleError, one_line
-from flexneedle.lab.igtl.records import InsertionBegin, InsertionResult, NodeSetup, TargetWait
+from flexneedle.errors import FlexneedleError, InputError, one_line
+from flexneedle.lab.igtl.placement import place
+from flexneedle.lab.igtl.records import InsertionBegin, InsertionResult, NodeSetup, PeerGeometry, TargetWait
 from flexneedle.lab.igtl.settings import IgtlSettings
-from flexneedle.lab.images.frames import ImageRegistration
+from flexneedle.lab.images.frames import registration_of
 from flexneedle.lab.link.bridge import LinkBridge
 from flexneedle.lab.link.client import LinkClient
 from flexneedle.lab.link.records import LinkTarget
 from flexneedle.loop.events import Ended
 from flexneedle.planning.events import Event, Iterated
+from flexneedle.scenario.model import Scenario
 
 _PLANNING, _ENDED = "planning", "ended"
 
@@ -26,8 +29,9 @@ class IgtlBridge(LinkBridge):
     Args:
         settings: Address and names.
         show: Prints a line for the user; called in the thread of the insertion only.
-        registration: Map of the image to the needle's frame, None if it is not known (yet): then geometry is sent in
-            the needle's frame until a peer sends one.
+        scenario: Scenario of the insertion. Geometry is sent in the frame of its image, or without one in the needle's.
+        awaits: Whether `await_target` follows.
+        forward: Called in another thread with what is received between insertions (default: it is refused).
 
     Raises RunError if the port is taken or the node does not start.
     """
@@ -38,14 +42,21 @@ class IgtlBridge(LinkBridge):
         self,
         settings: IgtlSettings,
         show: Callable[[str], None] = _ignore,
-        registration: ImageRegistration | None = None,
+        scenario: Scenario | None = None,
+        *,
+        awaits: bool = False,
+        forward: Callable[[PeerGeometry], object] | None = None,
     ) -> None:
         self.settings = settings
         self._on_stop: Callable[[str], None] = _ignore
-        self._over = False
+        self._scenario, self._awaits, self._forward = scenario, awaits, forward
+        self._placed: Scenario  # with the target that was awaited
+        self._over = forward is not None
+        registration = None if scenario is None else registration_of(scenario)
 
         def open_node(epoch: float) -> LinkClient:
-            return LinkClient(f"{__package__}.node", NodeSetup(settings, epoch, registration), self.protocol)
+            setup = NodeSetup(settings, epoch, registration, awaits or self._over)
+            return LinkClient(f"{__package__}.node", setup, self.protocol)
 
         super().__init__(open_node, self._first_record, show)
 
@@ -62,20 +73,20 @@ class IgtlBridge(LinkBridge):
     @contextmanager
     def insertion(
         self,
+        scenario: Scenario,
         show: Callable[[str], None] = _ignore,
-        registration: ImageRegistration | None = None,
         on_stop: Callable[[str], None] = _ignore,
     ) -> Iterator[None]:
         """Publish another insertion than the first: earlier stops and targets do not count.
 
         Args:
+            scenario: As for the class.
             show: As for the class.
-            registration: As for the class; None: the one that was received last, if any, remains.
             on_stop: Called with the reason of a stop, in another thread.
         """
         self._begin(self._first_record, show)
-        self._on_stop, self._over = on_stop, False
-        self._node.publish(InsertionBegin(registration))
+        self._on_stop, self._over, self._scenario = on_stop, False, scenario
+        self._node.publish(InsertionBegin(registration_of(scenario)))
         self._change_state("idle")
         try:
             yield
@@ -84,6 +95,8 @@ class IgtlBridge(LinkBridge):
             raise
         finally:
             self._announce_end()
+            if self._forward is not None:
+                self._node.publish(TargetWait())
 
     def end(self, text: str) -> None:
         """End the insertion with its result in one line; later stops have no effect."""
@@ -91,13 +104,14 @@ class IgtlBridge(LinkBridge):
         self._node.publish(InsertionResult(self._now(), text))
         self._change_state(_ENDED, text)
 
-    def await_target(self) -> LinkTarget:
-        """Wait for a target, and an entry before it or with it (mm, needle's frame).
+    def await_target(self) -> Scenario:
+        """Wait for a target, and an entry before it or with it; return the scenario with them and the registration.
 
         Raises StoppedError after a stop, RunError without the node.
         """
-        self._node.publish(TargetWait())
-        return self._await_target("a target of a peer")
+        self._await_target("a target of a peer")
+        self._node.publish(InsertionBegin(registration_of(self._placed)))
+        return self._placed
 
     def __call__(self, event: Event) -> None:
         """Publish an event. After a stop, raises StoppedError at each event in the insertion's thread."""
@@ -114,6 +128,38 @@ class IgtlBridge(LinkBridge):
     def _finish(self, text: str) -> None:
         if not self._over:
             self.end(text)
+
+    def _take(self, record: Any) -> None:
+        if not isinstance(record, PeerGeometry):
+            super()._take(record)
+        elif self._forward is not None and self._over:
+            self._forward(record)
+        else:
+            self._receive(record)
+
+    def _receive(self, received: PeerGeometry) -> None:
+        """Place what was received in the scenario, if it is awaited."""
+        scenario = self._scenario
+        try:
+            if scenario is None or not (self._awaits or self._is_comparable(received)):
+                what = "registration of the image" if received.target is None else "target"
+                raise InputError(f"{what}: not awaited, the insertion has begun without it")
+            placed = place(scenario, received, self.settings.entry_radius)
+            scenario = scenario.with_values(placed.values)
+        except FlexneedleError as error:
+            self._note_others(f"{received.source}: refused: {one_line(error)}")
+            return
+        for line in placed.lines:
+            self._note_others(f"{received.source}: {line}")
+        if received.target is not None:
+            self._scenario = self._placed = scenario
+            self._awaits = False
+            self._target = LinkTarget(self._now(), scenario.target.position)
+
+    def _is_comparable(self, received: PeerGeometry) -> bool:
+        """Return whether it is a registration that may be the scenario's."""
+        has_image = self._scenario is not None and registration_of(self._scenario) is not None
+        return has_image and received.target is None
 
     def _stop(self, who: str) -> None:
         if self._over:

@@ -36,7 +36,7 @@ _LONGEST_NAME = 20  # bytes
 
 @dataclass
 class IgtlComposer:
-    """Makes messages; keeps the last plan, period and state.
+    """Makes messages; keeps the last plan and state.
 
     epoch: Unix time (s) of the records' time 0; registration: of the image, None if it is not known.
     """
@@ -44,16 +44,16 @@ class IgtlComposer:
     epoch: float = 0.0
     registration: ImageRegistration | None = None
     _plan: Plan | None = field(default=None, init=False)
-    _period: Period | None = field(default=None, init=False)
     _state: LinkState = field(default=LinkState(0.0, "idle"), init=False)
     _ahead: float | None = field(default=None, init=False)  # of the records' time before this process's
     _read_at: float | None = field(default=None, init=False)  # time of the newest accepted reading
     _seen_at: float = field(default=0.0, init=False)  # when the period arrived
     _seen_age: float = field(default=0.0, init=False)  # age of the reading then
 
-    def begin(self) -> None:
-        """Forget the needle of the last insertion: its readings are no longer new."""
-        self._plan = self._period = self._read_at = None
+    def begin(self, registration: ImageRegistration | None) -> None:
+        """Begin an insertion: the readings of the last one are no longer new."""
+        self.registration = registration
+        self._plan = self._read_at = None
 
     def compose(self, record: object, now: float) -> Iterator[Message]:
         """Yield the messages of a record, at a time (s) of this process; none for a record of another kind."""
@@ -71,13 +71,6 @@ class IgtlComposer:
                 yield self.make_status(now)
             case InsertionResult(time, text):
                 yield self._make_string(time, text)
-
-    def recompose(self) -> Iterator[Message]:
-        """Yield the geometry again, after a change of the registration."""
-        if self._plan is not None:
-            yield from self._make_path(self._plan)
-        if self._period is not None:
-            yield from self._make_geometry(self._period)
 
     def make_status(self, now: float) -> StatusMessage:
         """Return state, age of the newest accepted reading and frame, at a time (s) of this process."""
@@ -105,7 +98,6 @@ class IgtlComposer:
         return max(0.0, self.epoch + time)
 
     def _keep(self, period: Period, now: float) -> None:
-        self._period = period
         if period.verdict.ok:
             self._read_at = period.measurement.time
         if self._read_at is not None:

@@ -18,28 +18,26 @@ from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.igtl.composer import IgtlComposer
 from flexneedle.lab.igtl.endpoint import describe_failure, make_endpoint
 from flexneedle.lab.igtl.messages import Message
-from flexneedle.lab.igtl.records import InsertionBegin, InsertionResult, NodeSetup, TargetWait
-from flexneedle.lab.igtl.requests import PathRequest, StopRequest, check_entry, read_request, to_needle
+from flexneedle.lab.igtl.records import InsertionBegin, NodeSetup, PeerGeometry, TargetWait
+from flexneedle.lab.igtl.requests import PathRequest, StopRequest, read_request
 from flexneedle.lab.images.frames import ImageRegistration
-from flexneedle.lab.link.records import LinkNote, LinkRefusal, LinkStop, LinkTarget, NodeHeartbeat, NodeLoss
+from flexneedle.lab.link.records import LinkNote, LinkRefusal, LinkStop, NodeHeartbeat, NodeLoss
 from flexneedle.lab.process import MessageChannel, open_channel
-from flexneedle.results import Period
 from flexneedle.types import Point
 
 BEAT_S = 0.1
 _STATUS_BEATS = 5  # beats from one STATUS to the next, while nothing is published
 _MOST_NOTED = 64  # names of unused messages that are reported
 
-_BEGUN = "the insertion has begun"
-
 
 class IgtlNode:
-    """Reads requests, and sends messages. `frozen`: why the registration may not change, "" if it may."""
+    """Reads requests, and sends messages."""
 
     def __init__(self, setup: NodeSetup, channel: MessageChannel) -> None:
         self._settings, self._channel = setup.settings, channel
         self._composer = IgtlComposer(setup.epoch, setup.registration)
-        self._awaits_target, self.frozen = False, ""
+        self._awaits_target = setup.awaits
+        self._registration: ImageRegistration | None = None  # the one received last
         self._entry: Point | None = None
         self._refused, self._refused_at = 0, -BEAT_S
         self._noted: set[tuple[str, str]] = set()
@@ -86,17 +84,11 @@ class IgtlNode:
         """Publish a record."""
         match record:
             case InsertionBegin(registration):
-                self._awaits_target, self.frozen, self._entry = False, "", None
+                self._awaits_target, self._entry = False, None
                 self._noted.clear()
-                self._composer.begin()
-                if registration is not None:
-                    self._composer.registration = registration
+                self._composer.begin(registration)
             case TargetWait():
                 self._awaits_target = True
-            case Period():
-                self.frozen = self.frozen or _BEGUN
-            case InsertionResult():
-                self._awaits_target, self.frozen = False, ""
         self._send(self._composer.compose(record, monotonic()))
 
     def _send(self, messages: Iterable[Message]) -> None:
@@ -126,14 +118,9 @@ class IgtlNode:
             self._refuse(peer, f"{_name(message)}: {error}")
 
     def _register(self, registration: ImageRegistration, peer: str) -> None:
-        if registration == self._composer.registration:
-            return
-        if self.frozen:
-            raise InputError(f"the registration may not change: {self.frozen}")
-        self._composer.registration = registration
-        x, y, z = registration.translation
-        self._note(f"registration of the image from {peer}: its origin is at {x:g}, {y:g}, {z:g} mm")
-        self._send(self._composer.recompose())
+        if registration != self._registration:  # a peer may repeat it
+            self._registration = registration
+            self._channel.send(PeerGeometry(peer, registration))
 
     def _aim(self, path: PathRequest, message: Message, peer: str) -> None:
         if not self._awaits_target:
@@ -141,13 +128,9 @@ class IgtlNode:
             return
         if path == PathRequest(None, None):
             raise InputError("no point is named Target or Entry")
-        registration = self._composer.registration
-        if path.entry is not None:
-            self._entry = check_entry(to_needle(registration, path.entry))
+        self._entry = path.entry or self._entry
         if path.target is not None:
-            target = to_needle(registration, path.target)
-            self._awaits_target, self.frozen = False, "the target was placed by it"
-            self._channel.send(LinkTarget(monotonic(), target, self._entry))
+            self._channel.send(PeerGeometry(peer, self._registration, path.target, self._entry))
 
     def _refuse(self, peer: str, reason: str) -> None:
         """Report a refusal, unless it follows another one soon, as in a flood of messages."""

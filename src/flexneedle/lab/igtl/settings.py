@@ -1,5 +1,6 @@
 """Settings of the connection of an insertion to OpenIGTLink."""
 
+import math
 import socket
 from dataclasses import dataclass
 
@@ -51,7 +52,9 @@ class IgtlSettings:
     Args:
         address: Address of the server.
         registration: Device name of a TRANSFORM from the image to the needle's frame.
+        entry_radius: Radius (mm) around the axis in which the skin of a case by an image was fitted.
     """
 
     address: IgtlAddress = IgtlAddress()
     registration: str = REGISTRATION
+    entry_radius: float = math.inf

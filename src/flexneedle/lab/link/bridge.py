@@ -260,8 +260,7 @@ class LinkBridge(Gate):
                 self._note_others(text)
 
     def _take_target(self, target: LinkTarget) -> None:
-        entry = "" if target.entry is None else f", entry {_to_text(target.entry)}"
-        shown = f"target {_to_text(target.point)} mm{entry and f'{entry} mm'}"
+        shown = f"target {', '.join(f'{value:g}' for value in target.point)} mm"
         if self._awaited == "target":
             self._note(shown)
             self._target = target
@@ -278,7 +277,3 @@ class LinkBridge(Gate):
             self._note(f"stop: {who}")
         if supervisor is None:
             self._change_state("stopped", self._stopped)
-
-
-def _to_text(point: tuple[float, ...]) -> str:
-    return ", ".join(f"{value:g}" for value in point)

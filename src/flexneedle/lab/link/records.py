@@ -25,14 +25,10 @@ class LinkState:
 
 @dataclass(frozen=True)
 class LinkTarget:
-    """A target that is published, or that another program requests.
-
-    entry: point at which the needle shall enter the skin, None if it is not requested.
-    """
+    """A target that is published, or that another program requests."""
 
     time: float
     point: Point
-    entry: Point | None = None
 
 
 # Received. source: topic or peer.

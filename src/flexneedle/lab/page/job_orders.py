@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from flexneedle.lab.igtl.records import PeerGeometry
 from flexneedle.lab.page.protocol import JobKind, Recording, ServerMessage, Strategy
 from flexneedle.lab.page.requests import DisturbRequest
 from flexneedle.lab.page.shape_frames import ShapeFrame
@@ -120,5 +121,5 @@ class RigReport:
     moves: tuple[str, ...] = ()
 
 
-Report = ServerMessage | ShapeFrame | RigReport | WorkerReady
+Report = ServerMessage | ShapeFrame | RigReport | PeerGeometry | WorkerReady
 """Everything that a worker sends."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from flexneedle.errors import describe_error
+from flexneedle.lab.igtl.records import PeerGeometry
 from flexneedle.lab.page.job_orders import JobChange, Report, RigReport, WorkerReady, WorkOrder
 from flexneedle.lab.page.protocol import JobKind, JobMessage
 from flexneedle.lab.page.server.clients import PageLimits
@@ -181,7 +182,7 @@ class JobQueue:
         match report:
             case WorkerReady():
                 self._start_next()
-            case RigReport():
+            case RigReport() | PeerGeometry():
                 self._on_report(report)
             case JobMessage():
                 if running is None or report.job != running.order.job:

@@ -1,6 +1,7 @@
 """Dispatch requests; handle connects and disconnects."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -9,8 +10,9 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any, assert_never
 
+from flexneedle.lab.igtl.records import PeerGeometry
 from flexneedle.lab.page import requests as ask
-from flexneedle.lab.page.job_orders import Action, WorkOrder
+from flexneedle.lab.page.job_orders import Action, Report, WorkOrder
 from flexneedle.lab.page.protocol import (
     ClosedMessage,
     InsertionMessage,
@@ -28,6 +30,7 @@ from flexneedle.lab.page.server.hub import ClientOutbox, Hub
 from flexneedle.lab.page.server.job_queue import JobQueue
 from flexneedle.lab.page.server.live_insertion import LiveInsertion
 from flexneedle.lab.page.server.page_session import PageSession
+from flexneedle.lab.page.server.received_edits import ReceivedEdits
 from flexneedle.lab.page.server.runs_folder import RunsFolder
 from flexneedle.lab.page.shape_frames import FrameSource
 from flexneedle.scenario.library import PRESETS
@@ -40,13 +43,17 @@ _WORK: tuple[JobKind, ...] = ("needle", "estimate", *_SEARCHES, "recording", "st
 
 @dataclass(frozen=True)
 class PageSetup:
-    """Settings of a server. workers: module and arguments of the worker of plans, and of the one of insertions."""
+    """Settings of a server.
+
+    workers: module and arguments of the worker of plans, and of the one of insertions; entry_radius: as in `place`.
+    """
 
     session: PageSession
     runs: Path
     limits: PageLimits
     workers: tuple[Sequence[str], Sequence[str]]
     rig: RigReference | None = None
+    entry_radius: float = math.inf
 
 
 class RequestHandler:
@@ -62,8 +69,9 @@ class RequestHandler:
         self._rig_name = None if setup.rig is None else setup.rig.name
         self._started, self._initial = token_hex(8), setup.session.digest(self._rig_name)
         self._insertions = JobQueue(
-            insertions, self.hub, setup.limits, numbers, self._end_job, self.live.take
+            insertions, self.hub, setup.limits, numbers, self._end_job, self._take_report
         )
+        self._received = ReceivedEdits(self.live, setup.entry_radius)
         self._history = SessionHistory()
         self._timers = dict[str, asyncio.TimerHandle]()
         self._watching: asyncio.Task[None] | None = None
@@ -354,6 +362,16 @@ class RequestHandler:
                 raise Refusal("no row of a study is shown there: open one first")
             jobs, order = self._plans, WorkOrder("save_row", "save", name=request.name, of=request.of)
         jobs.add(replace(order, folder=str(self.runs.new(request.name))))
+
+    # The worker of insertions
+
+    def _take_report(self, report: Report) -> None:
+        if not isinstance(report, PeerGeometry):
+            self.live.take(report)
+            return
+        session, keys = self._received.edit(self.session, report)
+        if session is not self.session:
+            self._step(session, keys)
 
     # Timers and ends of jobs
 

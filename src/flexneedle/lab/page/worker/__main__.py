@@ -44,7 +44,7 @@ def main() -> int:
     warm_up()
     versions()  # read now, while the files are still those that were imported
     channel.send(WorkerReady())
-    link, rows = IgtlLink(sys.argv[_OPTIONS:]), ShownRows()
+    link, rows = IgtlLink(sys.argv[_OPTIONS:], channel.send), ShownRows()
     insertions = InsertionJobs(link)
     actions: Actions = {
         "needle": needle,

@@ -1,0 +1,131 @@
+"""Received registrations, targets and entries as values of a scenario: one registration for everything."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.lab.igtl.records import PeerGeometry
+from flexneedle.lab.images.frames import ImageRegistration, registration_of
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.zones import ZoneFile
+from flexneedle.types import FARTHEST_MM, Point
+
+FAR_FROM_SKIN_MM = 5.0
+"""Largest distance of an entry from the skin, the plane x = 0 of the needle's frame."""
+SAME_MM = 0.1
+"""Largest distance of two registrations, in a box around the insertion, that count as the same one."""
+_BOX = np.array([*product((0.0, 200.0), (-100.0, 100.0), (-100.0, 100.0))])  # corners, needle's frame
+_ROUNDING_MM = 1e-4  # of numbers with 32 bits, by which a point in the plane may be off
+_SHOWN = 4  # digits
+
+
+@dataclass(frozen=True)
+class Placement:
+    """values: of the scenario, by key; lines: about them, and what is outside of the model's assumptions."""
+
+    values: dict[str, Any]
+    lines: tuple[str, ...]
+
+
+def place(scenario: Scenario, received: PeerGeometry, entry_radius: float = math.inf) -> Placement:
+    """Return what is received as values of a scenario, whose section `image` counts if it is set.
+
+    entry_radius: largest distance (mm) of an entry from the axis in a scenario with an image. Raises InputError for
+    another registration than the scenario's without a target by it, and for points that are too far.
+    """
+    own = registration_of(scenario)
+    registration = own or received.registration
+    values = _image_values(registration) if own is None and registration is not None else {}
+    if received.target is None:
+        return Placement(values, (_describe_registration(own, received.registration),))
+    lines = [*_describe_image(scenario)] if values else []
+    target = _to_needle(scenario, registration, received.target)
+    values |= dict(zip(("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"), target, strict=True))
+    shown = f"target {_to_text(target)} mm"
+    entry = (0.0, scenario.entry.lateral_mm, scenario.entry.lateral_z_mm)
+    if received.entry is not None:
+        entry = _to_needle(scenario, registration, received.entry)
+        _check_entry(entry, math.inf if own is None else entry_radius)
+        values |= {"entry.lateral_mm": entry[1], "entry.lateral_z_mm": entry[2]}
+        shown += f", entry {_to_text(entry)} mm"
+    return Placement(values, (*lines, shown, *_doubts(entry, target, has_image=own is not None)))
+
+
+def distance_between(one: ImageRegistration, other: ImageRegistration) -> float:
+    """Return the largest distance (mm) of a point mapped by both, within 100 mm of the axis and 200 mm deep."""
+    return float(np.linalg.norm(other.apply(one.inverse().apply(_BOX)) - _BOX, axis=1).max())
+
+
+def _image_values(registration: ImageRegistration) -> dict[str, Any]:
+    return {
+        "image.rotation": list(registration.rotation),
+        "image.translation_mm": list(registration.translation),
+        "image.sd_mm": 0.0,
+    }
+
+
+def _describe_registration(own: ImageRegistration | None, received: ImageRegistration | None) -> str:
+    """Return a line about a received registration. Raises InputError if it is not the scenario's."""
+    if own is None or received is None:
+        origin = (0.0, 0.0, 0.0) if received is None else received.translation
+        return f"registration of the image: its origin is at {_to_text(origin)} mm"
+    off = distance_between(own, received)
+    if off > SAME_MM:
+        rule = f"must be at most {SAME_MM:g} mm, within 100 mm of the axis and to a depth of 200 mm"
+        raise InputError(
+            f"registration of the image: differs from [image] of the scenario by up to {off:.2g} mm: {rule}; "
+            "[image] is kept"
+        )
+    return "registration of the image: [image] of the scenario"
+
+
+def _describe_image(scenario: Scenario) -> Iterator[str]:
+    yield "[image] of the scenario: the received registration, with sd 0, so nothing is added to margins"
+    if names := [zone.name for zone in scenario.zone if isinstance(zone, ZoneFile)]:
+        yield f"zones in files are placed by it: {', '.join(names)}"
+
+
+def _to_needle(scenario: Scenario, registration: ImageRegistration | None, point: Point) -> Point:
+    """Return a point of a peer (mm) in the needle's frame. Raises InputError for one farther than 10 m."""
+    given = np.array(point)
+    x, y, z = (given if registration is None else registration.apply(given)).tolist()
+    if not math.hypot(x, y, z) <= FARTHEST_MM:
+        raise InputError(f"point {_to_text(point)}: farther than 10 m")
+    return x, y, 0.0 if scenario.setup.axes == 1 and abs(z) <= _ROUNDING_MM else z
+
+
+def _check_entry(entry: Point, radius: float) -> None:
+    """Raise InputError for an entry in the needle's frame that is far from the skin, or from where it was fitted."""
+    x, y, z = entry
+    opening = f"entry {_to_text(entry)} mm in the needle's frame"
+    if abs(x) > FAR_FROM_SKIN_MM:
+        raise InputError(
+            f"{opening}: must be within {FAR_FROM_SKIN_MM:g} mm of the skin (x = 0): is the registration right?"
+        )
+    if (off := math.hypot(y, z)) > radius:
+        raise InputError(
+            f"{opening}: {off:.1f} mm from the entry of the case: must be within its skin_radius_mm ({radius:g}), "
+            "where the skin was fitted; move the entry of the case"
+        )
+
+
+def _doubts(entry: Point, target: Point, *, has_image: bool) -> Iterator[str]:
+    """Yield what the import of an image checks for its own points, and what is left of a received entry."""
+    (depth, *off), (at, *way) = entry, target
+    if abs(depth) > SAME_MM:
+        yield f"entry: {abs(depth):.2g} mm {'below' if depth > 0.0 else 'above'} the skin, taken on it"
+    if has_image:
+        angle = math.degrees(math.atan2(math.dist(off, way), at))
+        yield (
+            f"outside of the model's assumptions: skin and layers are of the axis, {math.hypot(*off):.1f} mm "
+            f"from the entry, at an angle of {angle:.1f} degrees to the line from entry to target; not fitted again"
+        )
+
+
+def _to_text(point: tuple[float, ...]) -> str:
+    return ", ".join(f"{round(value, _SHOWN):zg}" for value in point)
