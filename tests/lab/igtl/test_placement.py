@@ -138,11 +138,11 @@ def test_a_turn_is_measured_at_the_farthest_corner():
 def test_what_an_import_checks_is_named_with_its_size_and_an_entry_beyond_its_skin_is_refused(case):
     own = registration_of(case)
     entry, target = own.inverse().apply(np.array([[-1.25, 3.0, 4.0], [40.0, 3.0, 11.0]])).tolist()
-    *_, depth, doubt = place(case, PeerGeometry("peer", None, tuple(target), tuple(entry)), 15.0).lines
+    *_, depth, doubt = place(case, PeerGeometry("peer", None, tuple(target), tuple(entry)), 16.0).lines
     assert depth == "entry: 1.2 mm above the skin, taken on it"
     assert "5.0 mm from the entry, at an angle of 9.9 degrees" in doubt  # atan 7/40
-    with pytest.raises(InputError, match=r"5\.0 mm from the entry of the case: .*skin_radius_mm \(4\.9\)"):
-        place(case, PeerGeometry("peer", None, tuple(target), tuple(entry)), 4.9)
+    with pytest.raises(InputError, match=r"5\.0 mm from the entry of the case: .*free_radius_mm \(4\.9 mm\)"):
+        place(case, PeerGeometry("peer", None, tuple(target), tuple(entry)), 14.9)
 
 
 def test_points_that_cannot_be_are_refused():

@@ -61,7 +61,7 @@ def test_a_registration_alone_is_edited_and_another_one_is_refused(capsys):
     [
         (PATH, {"runs": True}, "an insertion runs"),
         (PeerGeometry("peer", None, (900.0, 0.0, 0.0)), {}, "target.depth_mm = 900"),
-        (PATH, {"session": edit(PeerGeometry("peer", IMAGE)), "radius": 7.0}, "skin_radius_mm (7)"),
+        (PATH, {"session": edit(PeerGeometry("peer", IMAGE)), "radius": 7.0}, "skin_radius_mm less"),
     ],
 )
 def test_what_cannot_be_edited_is_one_line_and_printed_once(received, more, reason, capsys):

@@ -50,7 +50,8 @@ def place(scenario: Scenario, received: PeerGeometry, entry_radius: float = math
     entry = (0.0, scenario.entry.lateral_mm, scenario.entry.lateral_z_mm)
     if received.entry is not None:
         entry = _to_needle(scenario, registration, received.entry)
-        _check_entry(entry, math.inf if own is None else entry_radius)
+        fitted = max(0.0, entry_radius - scenario.entry.free_radius_mm)
+        _check_entry(entry, math.inf if own is None else fitted)
         values |= {"entry.lateral_mm": entry[1], "entry.lateral_z_mm": entry[2]}
         shown += f", entry {_to_text(entry)} mm"
     return Placement(values, (*lines, shown, *_doubts(entry, target, has_image=own is not None)))
@@ -109,8 +110,8 @@ def _check_entry(entry: Point, radius: float) -> None:
         )
     if (off := math.hypot(y, z)) > radius:
         raise InputError(
-            f"{opening}: {off:.1f} mm from the entry of the case: must be within its skin_radius_mm ({radius:g}), "
-            "where the skin was fitted; move the entry of the case"
+            f"{opening}: {off:.1f} mm from the entry of the case: must be within its skin_radius_mm less "
+            f"entry.free_radius_mm ({radius:g} mm), where the skin was fitted; move the entry of the case"
         )
 
 
