@@ -78,12 +78,12 @@ def test_the_clearance_of_a_zone_is_from_where_the_vessel_is(folder):
 
 
 def test_what_is_added_to_the_margin_of_a_zone_is_printed(folder):
-    """Twice the registration's 0.5 mm, and the rest."""
+    """2.33 times the registration's 0.5 mm, and the rest."""
     made = import_case(write_case(folder))
-    added = zones_of(made.scenario).added[0] - 1.0
+    added = zones_of(made.scenario).added[0] - 2.33 * 0.5
     (line,) = [line for line in made.lines if line.startswith("zone to avoid: ")]
     assert line == (
-        f"zone to avoid: vessel, margin 3 mm + 1 mm registration + {added:.2g} mm voxels and contacts"
+        f"zone to avoid: vessel, margin 3 mm + 1.2 mm registration + {added:.2g} mm voxels and contacts"
     )
 
 

@@ -70,8 +70,8 @@ class ImageCase(Section):
     skin_radius_mm: Annotated[float, Field(ge=5, le=100)] = 15.0
     """Radius around the entry in which a plane is fitted to the skin, and layers are checked."""
     registration_sd_mm: NonNegative
-    """Standard deviation, on each axis, of a point of the image in the needle frame. Twice this value is added to the
-    margin of each zone."""
+    """Standard deviation, on each axis, of a point of the image in the needle frame. 2.33 times this value is added to
+    the margin of each zone."""
     free_radius_mm: NonNegative | None = None
     """`entry.free_radius_mm`. Not set: as in `scenario`."""
     free_slope_mrad: Annotated[float, Field(ge=0, le=STEEPEST_MRAD)] | None = None

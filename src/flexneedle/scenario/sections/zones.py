@@ -20,8 +20,8 @@ from flexneedle.scenario.sections.environment import Direction, Vector
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title, one_line
 from flexneedle.scenario.sections.registration import UnitQuaternion
 
-REGISTRATION_SDS = 2.0
-"""Standard deviations of the image's registration that are added to each margin."""
+REGISTRATION_SDS = 2.33
+"""Standard deviations of the image's registration that are added to each margin: 99 % of errors in a direction."""
 
 
 class ImageSettings(Section):
@@ -35,7 +35,8 @@ class ImageSettings(Section):
     translation_mm: Vector = (0.0, 0.0, 0.0)
     """Position x, y, z of the image's origin in the insertion frame."""
     sd_mm: NonNegative = 0.0
-    """Standard deviation of a mapped point on each axis. Twice this value is added to the margin of each zone."""
+    """Standard deviation of a mapped point on each axis. 2.33 times this value is added to the margin of each zone:
+    99 % of the errors towards a needle are smaller."""
     doubts: Annotated[str, AfterValidator(one_line)] | None = None
     """Lines of `flexneedle image check` about what is outside of the model's assumptions, separated by `; `."""
 
