@@ -1,9 +1,9 @@
 """The zones of a scenario as arrays of the kernels, with what is added to their margins.
 
-A zone is larger here than in the scenario by what is not known or not computed: 2.33 times the standard deviation of the
-image's registration, the error of a grid of distances, and the sag of the path between two contacts. So a clearance is
-a bound. A zone whose margin exceeds the least one is larger by the difference, too: each clearance is compared with the
-least margin.
+A zone is larger here than in the scenario by what is not known or not computed: 2.33 times the standard deviation of
+the image's registration, the error of a grid of distances, and the sag of the path between two contacts. So a clearance
+is a bound. A zone whose margin exceeds the least one is larger by the difference, too: each clearance is compared with
+the least margin.
 """
 
 import math
