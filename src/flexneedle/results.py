@@ -167,10 +167,16 @@ class Plan:
                 f"ends {distance} from the target; the guard would refuse it: {self.refusal} ({self.limit})"
             )
         if self.hit:
-            return f"reaches the target to {distance}"
+            return f"reaches the target to {distance}{self._load}"
         if self.reached:
             return f"ends {distance} from the target{binding}"
         return f"MISSES the target: best distance {distance}, more than {TARGET_RADIUS_MM:g} mm{binding}"
+
+    @property
+    def _load(self) -> str:
+        """Peak of the tissue energy if it is above E₁, the energy of all tissue displaced by 1 mm; else ""."""
+        peak = self.invasiveness.relative_energies[0]
+        return f", but the tissue energy peaks at {peak:.3g} E₁" if peak > 1.0 else ""
 
     @property
     def flips(self) -> int:

@@ -68,8 +68,14 @@ def test_a_target_is_reached_only_within_the_needle(diameter, miss, words):
     needle = {"needle.outer_diameter_mm": diameter, "needle.inner_diameter_mm": 0.5 * diameter}
     scenario = flexneedle.load_scenario("phantom").with_values(needle)
     x, y, z = PLAN.tip_mm
-    plan = replace(PLAN, target=(x, y, z + miss), scenario=scenario)
+    gentle = 0.0 * PLAN.strain_energy
+    plan = replace(PLAN, target=(x, y, z + miss), scenario=scenario, strain_energy=gentle)
     assert plan.summary == words
+    if plan.hit:
+        scale = scenario.energy_scale(plan.target[0])
+        assert replace(plan, strain_energy=gentle + 0.9 * scale).summary == words
+        loaded = replace(plan, strain_energy=gentle + 2.5 * scale)
+        assert loaded.summary == f"{words}, but the tissue energy peaks at 2.5 E₁"
     assert (plan.hit, plan.reached) == (words.startswith("reaches"), miss < 1.0)
     insertion = replace(make_insertion(miss=miss - 0.01), scenario=scenario)
     assert insertion.hit == plan.hit

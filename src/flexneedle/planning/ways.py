@@ -83,11 +83,11 @@ def find_ways(
     responses = Responses.of(rollout, problem)
     ways = responses.at_entries()
     costs = rate(problem, ways, room)
-    rated = [(ways, costs)]
-    if responses.columns:
-        moved = responses.with_guide(ways, costs, rng)
-        rated.append((moved, rate(problem, moved, room)))
-    return _choose(rated, count)
+    if not responses.columns:
+        return _choose(ways, costs, count)
+    moved = responses.with_guide(ways, costs, rng)
+    still = _choose(ways, costs, count // 2)  # gentler where both are clear
+    return np.concatenate([still, _choose(moved, rate(problem, moved, room), count - len(still))])
 
 
 def rate(problem: PlanProblem, ways: Ways, room: Room) -> Floats:
@@ -123,17 +123,14 @@ def measure_gaps(ways: Ways, room: Room) -> Floats:
     return room.clearances(points)
 
 
-def _choose(rated: list[tuple[Ways, Floats]], count: int) -> Floats:
+def _choose(ways: Ways, costs: Floats, count: int) -> Floats:
     """Return the coordinates (n, d) of the best paths that are apart from each other."""
-    z = np.concatenate([ways.z for ways, _ in rated])
-    paths = np.concatenate([ways.paths for ways, _ in rated])
-    costs = np.concatenate([cost for _, cost in rated])
     order = np.argsort(costs, kind="stable")[: _CANDIDATES * count]
     chosen: list[int] = []
     while len(chosen) < count and order.size:
         chosen.append(int(order[0]))
-        order = order[np.abs(paths[order] - paths[order[0]]).max(axis=1) > _APART_MM]
-    return z[chosen]
+        order = order[np.abs(ways.paths[order] - ways.paths[order[0]]).max(axis=1) > _APART_MM]
+    return ways.z[chosen]
 
 
 class Entries(NamedTuple):
