@@ -87,7 +87,8 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
     plan, last = insertion.plan, insertion.periods[-1]
     estimated = curves.estimated_path(insertion)
     known = [plan.tips, estimated, curves.true_path(insertion), np.array([plan.target])]
-    scene.draw_tissue(ax, scenario, known, view)
+    guide = scene.guide_path(scenario, _guide_travel(insertion)[:, 1:])
+    scene.draw_tissue(ax, scenario, [*known, guide], view)
     before = curves.intermediate_shapes(estimated, [period.shape for period in insertion.periods])
     zones.draw_zones(ax, scenario, curves.last_shape(insertion), view)
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle", view)

@@ -32,6 +32,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     with apply_style():
         figure, axes = _sheet(scenario, plans, list(panels))
         known = [*(plan.tips for plan in plans), np.array([plans[0].target])]
+        known += [scene.guide_path(scenario, plan.guide) for plan in plans]
         scenes: list[Axes] = []
         for plan, color in zip(plans, STRATEGIES, strict=False):
             drawn = [axes[plan.strategy + end] for end in scene.sections(scenario)]
