@@ -126,7 +126,7 @@ def _along(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     space.set_up_along(ax, scenario, [insertion.plan.tips, path, travel, np.array([insertion.target])])
     zones.draw_zones(ax, scenario, curves.last_shape(insertion), scene.ALONG)
     if scenario.setup.has_guide:
-        space.draw_guide_along(ax, travel[:, 1:], insertion.target)
+        space.draw_guide_along(ax, travel[:, 1:])
     space.draw_along(ax, path, insertion.plan.tips)
     _rolls(ax, scenario, insertion, scene.ALONG, space.arrow_along(ax))
     scene.draw_target(ax, insertion.target, scene.ALONG)
