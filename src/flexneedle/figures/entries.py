@@ -139,7 +139,7 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
     margins = [margin for margin, *_ in named_margins(found.scenario)]
     several = quantity.title.startswith("Clearance") and len(margins) > 1
     discs = _add_discs(ax, found, quantity.known, 0.92, cmap=_COLORS)
-    if several:  # no colour tells which margin is kept
+    if several:  # the colour alone does not show which margin is kept
         inside = quantity.known & ~found.clear
         _add_discs(ax, found, inside, 0.25, color=BAD, label="in the margin of a zone, or in a zone")
     if quantity.known.any():
