@@ -434,5 +434,5 @@ def scenario_of(record: Plan | Insertion) -> Scenario:
 
 def _mm(position: Sequence[float]) -> str:
     """Return a position as text, without z in the plane."""
-    x, y, *out = position[:3]
+    x, y, *out = (round(value, 3) + 0.0 for value in position[:3])  # zero without a sign
     return f"({', '.join(f'{value:g}' for value in (x, y, *(z for z in out if z != 0.0)))}) mm"

@@ -240,3 +240,16 @@ def test_the_same_data_give_the_same_bytes(tmp_path):
         for name in ("one", "two")
     )
     assert one == two
+
+
+def test_sections_show_the_whole_guide_of_an_entry_off_the_axis():
+    plan = INSERTION.plan
+    moved = replace(plan, guide=plan.guide + np.array([20.0, -15.0]))
+    with unarranged():
+        figure = plan_figure(SPACE, [moved])
+    jaws = [(ax, patch) for ax in figure.axes for patch in ax.patches if patch.get_gid() == "guide"]
+    jaws = [(ax, patch) for ax, patch in jaws if not isinstance(patch, Annulus)]
+    assert len(jaws) == 4
+    for ax, jaw in jaws:
+        low, high = ax.get_ylim()
+        assert low < jaw.get_y() < jaw.get_y() + jaw.get_height() < high

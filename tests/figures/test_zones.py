@@ -111,6 +111,9 @@ def with_clearance(scenario, insertion):
     return replace(insertion, plan=plan, periods=periods, scenario=scenario)
 
 
+MARGINS = ["margin of vessel", "margin of bone, node, rib"]
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_an_insertion_shows_true_estimated_and_planned_clearance_with_the_margins(known):
     scenario, made = with_zones("phantom"), make_insertion()
@@ -120,13 +123,13 @@ def test_an_insertion_shows_true_estimated_and_planned_clearance_with_the_margin
     with unarranged():
         figure = insertion_figure(scenario, made)
     (panel,) = axes(figure, "clearance")
-    expected = ["planned", *(["true"] if known else []), "estimated", "margin"]
+    expected = ["planned", *(["true"] if known else []), "estimated", *MARGINS]
     assert names(panel.get_legend()) == expected
     (estimated,) = lines(panel, "estimated")
     assert np.nanmin(estimated.get_ydata()) == made.least_clearance_mm
     least = made.true_clearance_mm if known else made.least_clearance_mm
     assert f"{least:.2f} mm" in texts(figure)
-    assert [lines(panel, name)[0].get_ydata()[0] for name in ("margin", "_margin")] == [1.0, 2.0]
+    assert [lines(panel, name)[0].get_ydata()[0] for name in MARGINS] == [1.0, 2.0]
 
 
 def test_figures_of_plans_and_insertions_in_space_show_zones():

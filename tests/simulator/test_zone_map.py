@@ -7,8 +7,9 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.files import digest_of
+from flexneedle.simulator.zone_doubts import find_zone_doubts
 from flexneedle.simulator.zones import NO_ZONES, zones_of, zones_of_record
-from zoned import BOX, SPHERE, grid_files, with_zones
+from zoned import BOX, CAPSULE, SPHERE, grid_files, with_zones
 
 CENTER, RADIUS = np.array(SPHERE["center_mm"]), SPHERE["radius_mm"]
 SCENARIO = with_zones("phantom3d", SPHERE)
@@ -86,3 +87,12 @@ def test_of_a_record_the_zones_whose_file_is_missing_or_has_changed_are_lost_and
     others = zones_of(with_zones("phantom3d", BOX)).distances(points)[0]
     np.testing.assert_array_equal(found.distances(points)[1], others)
     assert found.closest(points) is None
+
+
+def test_zones_that_reach_above_the_skin_are_doubted():
+    """Half a box of 3 by 6 mm, turned by 45°, is 4.5/√2 = 3.2 mm long."""
+    box, sphere = (zone | {"center_mm": [0.5, 0.0, 0.0]} for zone in (BOX, SPHERE))
+    capsule = CAPSULE | {"from_mm": [-1.0, 0.0, 0.0], "to_mm": [20.0, 0.0, 0.0]}
+    found = find_zone_doubts(with_zones("phantom", box, sphere, capsule))
+    assert [float(line.split(" mm above the skin")[0].split()[-1]) for line in found] == [2.7, 2.5, 2.5]
+    assert find_zone_doubts(with_zones("phantom")) == []

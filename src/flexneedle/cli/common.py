@@ -133,7 +133,7 @@ def with_target(scenario: Scenario, target: Sequence[float]) -> Scenario:
 
 def target_row(scenario: Scenario, target: Sequence[float]) -> tuple[str, str]:
     """Return the row of a table for a target x, y, z (mm), without z in the plane."""
-    shown = ", ".join(f"{value:g}" for value in target[: 1 + scenario.setup.axes])
+    shown = ", ".join(f"{round(value, 3) + 0.0:g}" for value in target[: 1 + scenario.setup.axes])
     return f"target (depth, lateral offset{'s' if scenario.setup.axes > 1 else ''})", f"{shown} mm"
 
 

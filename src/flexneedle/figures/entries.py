@@ -11,15 +11,17 @@ from flexneedle.figures import scene
 from flexneedle.figures.layout import legend_of, mosaic, short
 from flexneedle.figures.style import (
     BAD,
+    BOX,
     ESTIMATE,
     INK,
     QUIET,
     ZONE,
     apply_style,
+    halo,
     is_column,
     small,
 )
-from flexneedle.figures.zones import name_lost
+from flexneedle.figures.zones import name_lost, named_margins
 from flexneedle.planning.entry_map import EntryMap
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.zones import zones_of_record
@@ -31,10 +33,10 @@ _COLORS = "viridis"
 _SQUARE = {"clearance along": "Clearance (mm)", "offset along": "Tolerance (mm)"}  # in a column, side by side
 _LAYERS, _CELLS = 40, 120  # of the silhouette of a zone
 _SKIN_MM, _DEEP_MM = 0.01, 1e9
-_BOX = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 0.6}
 _EDGE = 0.15  # of the axes, without names
 _CENTRAL = 0.1  # mm of depth in a zone for 1 mm nearer to the middle
 _LONGEST = 16  # characters of a name
+_ABOVE_MM = 0.2  # of the scale of clearances above the largest margin
 _ROOM = 1.08  # of the disc of entries around it
 
 
@@ -97,8 +99,8 @@ def _draw_curve(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
     values = np.where(quantity.known, quantity.values, np.nan)
     ax.plot(y, values, ".-", color=ESTIMATE, markersize=3, zorder=3)
     if quantity.title.startswith("Clearance"):
-        for margin in sorted(set(zones_of_record(found.scenario).margins.tolist())):
-            ax.axhline(margin, color=ZONE, linestyle=":", linewidth=1.0, label="margin", zorder=2)
+        for margin, name, style in named_margins(found.scenario):
+            ax.axhline(margin, color=ZONE, linestyle=style, linewidth=1.0, label=name, zorder=2)
     for number, k in enumerate(found.best(NUMBERED)):
         how: dict[str, Any] = {"linewidth": 0.8, "linestyle": "--", "label": "next entries"}
         if not number:
@@ -134,11 +136,20 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
     _add_discs(ax, found, inside, 0.4, color=BAD, label="in the margin of a zone, or in a zone")
     if (away := other & found.clear).any():
         _add_discs(ax, found, away, 0.4, color=ESTIMATE, label="no zone in reach")
+    margins = [margin for margin, *_ in named_margins(found.scenario)]
+    several = quantity.title.startswith("Clearance") and len(margins) > 1
     discs = _add_discs(ax, found, quantity.known, 0.92, cmap=_COLORS)
+    if several:  # the colour alone does not show which margin is kept
+        inside = quantity.known & ~found.clear
+        _add_discs(ax, found, inside, 0.25, color=BAD, label="in the margin of a zone, or in a zone")
     if quantity.known.any():
-        discs.set_array(quantity.values[quantity.known])
+        values = quantity.values[quantity.known]
+        top = max(values.max(), margins[-1] + _ABOVE_MM) if several else _highest(values)
+        discs.set_array(values)
+        discs.set_clim(values.min(), top)
         figure: Any = ax.figure
-        bar = figure.colorbar(discs, ax=ax, shrink=0.8, pad=0.02)
+        extend = "max" if values.max() > top else "neither"
+        bar = figure.colorbar(discs, ax=ax, shrink=0.8, pad=0.02, extend=extend)
         bar.outline.set_visible(False)
         if quantity.title.startswith("Clearance"):
             _mark_margins(bar.ax, found.scenario)
@@ -147,10 +158,16 @@ def _draw_discs(ax: Axes, found: EntryMap, quantity: _Quantity) -> None:
         _mark(ax, found.points[k], number)
 
 
+def _highest(values: Floats) -> float:
+    """Return the largest value that is no outlier: at most 3 quartile distances above the upper quartile."""
+    lower, upper = np.percentile(values, [25.0, 75.0])
+    return float(values[values <= upper + 3.0 * (upper - lower)].max())
+
+
 def _mark_margins(bar: Axes, scenario: Scenario) -> None:
     """Mark the margins in the colour bar that it covers."""
     low, high = bar.get_ylim()
-    for margin in sorted(set(zones_of_record(scenario).margins.tolist())):
+    for margin, name, _ in named_margins(scenario):
         if low < margin < high:
             bar.axhline(margin, color=INK, linewidth=1.6)
             how: dict[str, Any] = {
@@ -160,7 +177,7 @@ def _mark_margins(bar: Axes, scenario: Scenario) -> None:
                 "va": "center",
             }
             place = bar.get_yaxis_transform()
-            bar.annotate("margin", (0.0, margin), xycoords=place, fontsize=small(), **how)
+            bar.annotate(name, (0.0, margin), xycoords=place, fontsize=small(), **how)
 
 
 def _set_up(ax: Axes, scenario: Scenario, title: str) -> None:
@@ -190,11 +207,14 @@ def _mark(ax: Axes, point: Floats, number: int) -> None:
     """Mark one of the best entries, with its number where there is room."""
     size, width = (5 if is_column() else 8), (1.6 if number == 1 else 0.8)
     how: dict[str, Any] = {"markersize": size, "markerfacecolor": "none", "markeredgewidth": width}
+    how["path_effects"] = halo(width + 2.0)
     label = "recommended entry" if is_column() else "recommended entry (1), and the next"
     ax.plot(*point[::-1], "o", markeredgecolor=INK, zorder=6, label=label, **how)
     if not is_column():
-        beside: dict[str, Any] = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": small()}
-        ax.annotate(str(number), (point[1], point[0]), bbox=_BOX, weight="bold", zorder=7, **beside)
+        beside: dict[str, Any] = {"xytext": (6, 5), "textcoords": "offset points", "fontsize": small()}
+        ax.annotate(
+            str(number), (point[1], point[0]), path_effects=halo(2.0), weight="bold", zorder=7, **beside
+        )
 
 
 def _draw_zones(ax: Axes, scenario: Scenario) -> None:
@@ -232,4 +252,4 @@ def _name(ax: Axes, z: Floats, y: Floats, distances: Floats, others: Floats, nam
         return
     where = float(right.flat[k]), float(up.flat[k])
     how: dict[str, Any] = {"color": ZONE, "fontsize": small(), "ha": "center", "va": "center"}
-    ax.text(*where, short(name, _LONGEST), bbox=_BOX, zorder=5, clip_on=True, **how)
+    ax.text(*where, short(name, _LONGEST), bbox=BOX, zorder=5, clip_on=True, **how)

@@ -87,7 +87,8 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
     plan, last = insertion.plan, insertion.periods[-1]
     estimated = curves.estimated_path(insertion)
     known = [plan.tips, estimated, curves.true_path(insertion), np.array([plan.target])]
-    scene.draw_tissue(ax, scenario, known, view)
+    guide = scene.guide_path(scenario, _guide_travel(insertion)[:, 1:])
+    scene.draw_tissue(ax, scenario, [*known, guide], view)
     before = curves.intermediate_shapes(estimated, [period.shape for period in insertion.periods])
     zones.draw_zones(ax, scenario, curves.last_shape(insertion), view)
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle", view)
@@ -125,7 +126,7 @@ def _along(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     space.set_up_along(ax, scenario, [insertion.plan.tips, path, travel, np.array([insertion.target])])
     zones.draw_zones(ax, scenario, curves.last_shape(insertion), scene.ALONG)
     if scenario.setup.has_guide:
-        space.draw_guide_along(ax, travel[:, 1:], insertion.target)
+        space.draw_guide_along(ax, travel[:, 1:])
     space.draw_along(ax, path, insertion.plan.tips)
     _rolls(ax, scenario, insertion, scene.ALONG, space.arrow_along(ax))
     scene.draw_target(ax, insertion.target, scene.ALONG)

@@ -12,7 +12,7 @@ from matplotlib.path import Path
 from matplotlib.quiver import Quiver
 from matplotlib.transforms import Affine2D, Bbox
 
-from flexneedle.figures.layout import TALLEST, fit, legend_of, short
+from flexneedle.figures.layout import MOVABLE, TALLEST, fit, legend_of, short
 from flexneedle.figures.scene import SKIN, Strip, strips
 from flexneedle.figures.style import QUIET, is_column, small
 from flexneedle.scenario.model import Scenario
@@ -40,11 +40,28 @@ def name_parts(
     """
     legend_of(figure, shown, facts)
     figure.draw_without_rendering()
+    for ax in scenes:
+        _move_texts(ax)
     left_out: set[Strip] = set()
     while not (found := {strip for ax in scenes for strip in _name_scene(ax, scenario)}) <= left_out:
         left_out |= found
         _name_below(figure, shown, facts, sorted(left_out, key=lambda strip: strip.top))
         figure.draw_without_rendering()
+
+
+def _move_texts(ax: Axes) -> None:
+    """Move texts that may be moved to a place in the axes over no other text, if there is one."""
+    for text in [text for text in ax.texts if text.get_gid() == MOVABLE]:
+        taken = [other.get_window_extent() for other in ax.texts if other is not text]
+        _, up = first = text.get_position()
+        for place in (first, (0, -up), (30, up), (-30, up), (30, -up), (-30, -up)):
+            text.set_position(place)
+            box = text.get_window_extent()
+            within = ax.bbox.y0 <= box.y0 and box.y1 <= ax.bbox.y1
+            if within and not any(box.overlaps(other) for other in taken):
+                break
+        else:
+            text.set_position(first)
 
 
 def _name_below(figure: Figure, shown: Sequence[Axes], facts: Sequence[str], layers: Sequence[Strip]) -> None:

@@ -23,6 +23,8 @@ COLUMNS: tuple[float, ...] = (1.8, 1.0)
 """Widths of a mosaic's columns, relative to each other."""
 UPRIGHT = "upright"
 """gid of a line whose mark in the legend is upright."""
+MOVABLE = "movable"
+"""gid of a text beside its mark that may go to its other sides."""
 ARROW = "arrow"
 """gid of arrows, whose mark in the legend is an arrow."""
 

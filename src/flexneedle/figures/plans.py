@@ -32,6 +32,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     with apply_style():
         figure, axes = _sheet(scenario, plans, list(panels))
         known = [*(plan.tips for plan in plans), np.array([plans[0].target])]
+        known += [scene.guide_path(scenario, plan.guide) for plan in plans]
         scenes: list[Axes] = []
         for plan, color in zip(plans, STRATEGIES, strict=False):
             drawn = [axes[plan.strategy + end] for end in scene.sections(scenario)]
@@ -92,7 +93,7 @@ def _draw_along(ax: Axes, scenario: Scenario, plan: Plan, *, single: bool) -> No
     space.set_up_along(ax, scenario, [plan.tips, travel, np.array([plan.target])])
     zones.draw_zones(ax, scenario, plan.shapes[-1], scene.ALONG)
     if scenario.setup.has_guide:
-        space.draw_guide_along(ax, plan.guide, plan.target)
+        space.draw_guide_along(ax, plan.guide)
     space.draw_along(ax, plan.tips, scale=not is_column() or single)
     space.draw_planned(ax, scenario, plan, scene.ALONG, space.arrow_along(ax))
     scene.draw_target(ax, plan.target, scene.ALONG)

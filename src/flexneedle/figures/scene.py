@@ -70,7 +70,9 @@ def color_of(record: Plan | Insertion) -> str:
 
 def place(scenario: Scenario, target: Point) -> str:
     """Return a target as text."""
-    depth, *lateral = (f"{format_signed(round(value, 2))} mm" for value in target[: 1 + scenario.setup.axes])
+    depth, *lateral = (
+        f"{format_signed(round(value, 2) + 0.0)} mm" for value in target[: 1 + scenario.setup.axes]
+    )
     return f"{depth} deep, {' and '.join(lateral)} lateral"
 
 
@@ -83,6 +85,12 @@ def draw_tissue(ax: Axes, scenario: Scenario, paths: Iterable[Floats], view: Vie
     tint_layers(ax, scenario)
     ax.axvline(0.0, color=SKIN, linewidth=1.6, zorder=1)
     ax.set(xlabel="depth (mm)", ylabel=lateral_label(scenario, view[1]))
+
+
+def guide_path(scenario: Scenario, travel: Floats) -> Floats:
+    """Return the points (k, 3) of the guide's travel y, z (k, 2); none (0, 3) without a guide."""
+    x = scenario.setup.guide_x
+    return np.empty((0, 3)) if x is None else np.column_stack([np.full(len(travel), x), travel])
 
 
 def lateral_label(scenario: Scenario, axis: int) -> str:

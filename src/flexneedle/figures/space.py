@@ -13,10 +13,10 @@ from flexneedle.figures import scene
 from flexneedle.figures.curves import Roll, planned_rolls, start_roll
 from flexneedle.figures.layout import ARROW
 from flexneedle.figures.scene import ALONG, View
-from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, format_signed, is_column, small
+from flexneedle.figures.style import BOX, ESTIMATE, GUIDE, PLAN, QUIET, TRUE, format_signed, is_column, small
 from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Point, X, Y, Z
+from flexneedle.types import Floats, X, Y, Z
 
 COLUMNS: tuple[float, ...] = (4.2, 0.2, 2.4)
 """Widths of the columns of a figure: the middle one is the end of a section, not of a panel."""
@@ -120,15 +120,14 @@ def _draw_depths(ax: Axes, path: Floats, *, scale: bool) -> None:
     bar.outline.set_visible(False)
 
 
-def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
-    """Draw the guide's path y, z (k, 2) along the axis, and the guide at its end, named away from the target."""
+def draw_guide_along(ax: Axes, travel: Floats) -> None:
+    """Draw the guide's path y, z (k, 2) along the axis, and the guide at its end, named towards the middle."""
     y, z = travel.T
     ax.plot(z, y, color=GUIDE, linewidth=1.0, zorder=3)
     ring = Annulus((z[-1], y[-1]), _RING, 0.25, facecolor=GUIDE, alpha=0.6, edgecolor="none", zorder=2)
     ring.set_gid("guide")
     ax.add_patch(ring)
-    up = 1 if target[Y] < y[-1] else -1
-    side = {1: "right", -1: "left"}.get(int(np.sign(z[-1] - target[Z])), "center")  # towards the target
-    beside: dict[str, Any] = {"ha": side, "va": "bottom" if up > 0 else "top", "fontsize": small()}
-    beside |= {"xytext": (0, 2 * up), "textcoords": "offset points", "color": GUIDE}
-    ax.annotate("guide" if is_column() else "guide and its path", (z[-1], y[-1] + up * _RING), **beside)
+    side = -1 if z[-1] > np.mean(ax.get_xlim()) else 1
+    beside: dict[str, Any] = {"ha": "left" if side > 0 else "right", "va": "center", "fontsize": small()}
+    beside |= {"xytext": (3 * side, 0), "textcoords": "offset points", "color": GUIDE, "bbox": BOX}
+    ax.annotate("guide", (z[-1] + side * _RING, y[-1]), **beside)

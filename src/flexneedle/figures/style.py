@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.transforms import Bbox
 
 from flexneedle.errors import InputError, describe_error
@@ -32,6 +33,8 @@ INK, QUIET = "#222222", "#6b6b6b"
 PLAN, ESTIMATE, TRUE, MEASURED, TARGET, BAD = "#222222", "#0072B2", "#D55E00", "#A8437F", "#00734f", "#B03A00"
 ZONE = "#6A4C93"
 NEEDLE, GUIDE = "#8a8f98", "#4d535c"
+BOX = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 0.6}
+"""Light box behind a text, as its `bbox`."""
 STRATEGIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 # The colour of z in space, beside the colour of y.
@@ -118,6 +121,11 @@ def is_narrow() -> bool:
 def small() -> float:
     """Return the font size of names inside a panel."""
     return 7.0 if is_narrow() else 8.0
+
+
+def halo(width: float) -> list[AbstractPathEffect]:
+    """Return the path effects of a mark on a white rim of this width (points)."""
+    return [withStroke(linewidth=width, foreground="white")]
 
 
 def tone(color: str, axis: int) -> str:

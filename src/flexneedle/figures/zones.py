@@ -5,6 +5,7 @@ that the needle is in a zone, or in its margin, where its curve is. A silhouette
 """
 
 from collections.abc import Iterable
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,16 +14,19 @@ from matplotlib.axes import Axes
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
+from flexneedle.figures.layout import MOVABLE, short
 from flexneedle.figures.panels import DepthPanel, Line
 from flexneedle.figures.scene import ALONG, View
-from flexneedle.figures.style import BAD, INK, ZONE, format_signed, is_column, small
+from flexneedle.figures.style import BAD, BOX, INK, ZONE, format_signed, is_column, small
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.zones import ZoneMap, workspace_corners, zones_of_record
 from flexneedle.types import Floats, X
 
 _CELLS, _COARSE = 360, 120  # of the raster of a section, and of a silhouette, to the right
 _LAYERS = 60  # of a silhouette, in depth
-_EDGE = 0.1  # no name has room in this share of the height of axes, beside their edges
+_EDGE = 0.1  # no name has room in this share of axes, beside their edges
+_LONGEST = 16  # characters of a name
+_STYLES = (":", "-.", "--")  # of lines of margins
 _DEEPEST = -1e9  # mm, below all distances
 
 
@@ -100,12 +104,12 @@ def _outline(ax: Axes, raster: _Raster, distances: Floats, level: float, style: 
 def _name(ax: Axes, raster: _Raster, distances: Floats, margin: float, name: str) -> None:
     """Write the name of a zone at its deepest point in the axes, or in its margin (mm), if it is in them."""
     edge = round(_EDGE * len(raster.up))
-    inner = distances[edge:-edge, edge:-edge]
+    inner = distances[edge:-edge, edge : -round(_EDGE * len(raster.right))]
     row, column = np.unravel_index(int(inner.argmin()), inner.shape)
     if inner[row, column] < margin:
         where = float(raster.right[edge + column]), float(raster.up[edge + row])
         how: dict[str, Any] = {"ha": "center", "va": "center", "color": INK, "fontsize": small()}
-        ax.text(*where, name, clip_on=True, zorder=8, **how).set_in_layout(False)
+        ax.text(*where, short(name, _LONGEST), clip_on=True, zorder=8, bbox=BOX, **how).set_in_layout(False)
 
 
 def draw_nearest(
@@ -121,12 +125,8 @@ def draw_nearest(
     if is_column():
         return
     up = np.sign(ends[0, 1] - ends[1, 1]) or 1.0  # away from the zone
-    beside: dict[str, Any] = {
-        "xytext": (0, 9 * up),
-        "textcoords": "offset points",
-        "ha": "center",
-        "va": "center",
-    }
+    beside: dict[str, Any] = {"xytext": (0, 9 * up), "textcoords": "offset points", "gid": MOVABLE}
+    beside |= {"ha": "center", "va": "center", "bbox": BOX}
     text = f"{format_signed(near.clearance, '.2f')} mm"
     ax.annotate(text, ends[0], fontsize=small(), **beside, **how).set_in_layout(False)
 
@@ -140,10 +140,23 @@ def clearance_panel(scenario: Scenario, lines: Iterable[Line]) -> DepthPanel:
     depths = np.concatenate([line.x[np.isfinite(line.y)] for line in shown])
     ends = np.array([depths.min(), depths.max()])
     margins = [
-        Line("_margin" if number else "margin", ends, np.full(2, margin), BAD, ":")
-        for number, margin in enumerate(sorted(set(zones_of_record(scenario).margins.tolist())))
+        Line(name, ends, np.full(2, margin), BAD, style) for margin, name, style in named_margins(scenario)
     ]
     return DepthPanel("Clearance from zones (mm)", [*shown, *margins], 1.0)
+
+
+def named_margins(scenario: Scenario) -> list[tuple[float, str, str]]:
+    """Return the margins (mm) of zones, each with its name, of which zones if they differ, and its style of line."""
+    zones = zones_of_record(scenario)
+    found: dict[float, list[str]] = {}
+    for margin, name in sorted(zip(zones.margins.tolist(), zones.names, strict=True)):
+        found.setdefault(margin, []).append(name)
+    if len(found) < 2:
+        return [(margin, "margin", _STYLES[0]) for margin in found]
+    return [
+        (margin, f"margin of {short(', '.join(names), _LONGEST)}", style)
+        for (margin, names), style in zip(found.items(), cycle(_STYLES), strict=False)
+    ]
 
 
 def name_lost(scenario: Scenario) -> str:

@@ -1,10 +1,12 @@
-"""Lines about images of zones: where they end within the needle's reach, and what their readers assumed."""
+"""Lines about zones above the skin, and about images: where they end in the needle's reach, what readers assumed."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
+from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections import zones as sections
 from flexneedle.simulator.zones import BESIDE_MM, ZoneImage, zones_of_record
 from flexneedle.types import Floats
 
@@ -13,8 +15,31 @@ _LEAST_MM = 0.5
 
 
 def find_zone_doubts(scenario: Scenario) -> list[str]:
-    """Return lines about the images of a scenario's zones. Raises InputError for a file that cannot be used."""
-    return [line for image in zones_of_record(scenario).images for line in describe_image(image, scenario)]
+    """Return lines about a scenario's zones and their images. Raises InputError for a file that cannot be used."""
+    images = zones_of_record(scenario).images
+    return [*_above_skin(scenario), *(line for image in images for line in describe_image(image, scenario))]
+
+
+def _above_skin(scenario: Scenario) -> Iterator[str]:
+    """Yield how far zones reach above the skin, of shapes with an end."""
+    for zone in scenario.zone:
+        above = -_top(zone)
+        if above >= _LEAST_MM:
+            yield f"zone {zone.name}: reaches {above:.1f} mm above the skin, where it is not avoided"
+
+
+def _top(zone: sections.Zone) -> float:
+    """Return the least depth (mm) of a zone; infinite for half-spaces and files."""
+    match zone:
+        case sections.Sphere():
+            return zone.center_mm[0] - zone.radius_mm
+        case sections.Capsule():
+            return min(zone.from_mm[0], zone.to_mm[0]) - zone.radius_mm
+        case sections.Box():
+            along = np.abs(to_matrix(np.array(zone.rotation))[0])
+            return zone.center_mm[0] - 0.5 * float(along @ np.array(zone.size_mm))
+        case _:
+            return np.inf
 
 
 def describe_image(image: ZoneImage, scenario: Scenario) -> Iterator[str]:
