@@ -35,9 +35,13 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     run = read_run(folder)
 
     def save_unless_kept(name: str, make: Callable[[], Figure]) -> list[Path]:
-        lost, old = [*zones_of_record(run.scenario).lost.values()], folder / f"{name}.png"
-        if lost and old.exists():
-            note(f"{old}: kept, since a new one would lack zones: {'; '.join(lost)}")
+        lost = [*zones_of_record(run.scenario).lost.values()]
+        old = [path for end in ("png", "svg") if (path := folder / f"{name}.{end}").exists()]
+        if lost and old:
+            kept = " and ".join(map(str, old))
+            note(
+                f"{kept}: kept (move it away to draw it), since a new one would lack zones: {'; '.join(lost)}"
+            )
             return []
         for reason in lost:
             note(f"not drawn: {reason}")
