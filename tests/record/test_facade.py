@@ -217,14 +217,19 @@ def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
 
 
 @pytest.mark.usefixtures("empty_figures")
-def test_a_run_is_drawn_without_the_file_of_a_zone_and_with_a_line_about_it(tmp_path):
+def test_without_the_file_of_a_zone_a_figure_is_kept_or_drawn_without_it_and_with_a_line_about_it(tmp_path):
     zone = {"shape": "file", "name": "artery", "file": str(tmp_path / "gone.stl")}
     scenario = PHANTOM.with_values({"zone": [zone]})
     folder = flexneedle.save(replace(INSERTION, scenario=scenario), tmp_path / "run")
-    notes = []
+    notes, kept = [], folder / "insertion.png"
+    kept.write_bytes(b"with the artery")
+    assert draw_run(folder, notes.append) == []
+    assert kept.read_bytes() == b"with the artery"
+    for path in folder.glob("insertion.*g"):
+        path.unlink()
     assert [path.name for path in draw_run(folder, notes.append)] == ["insertion.png", "insertion.svg"]
-    assert len(notes) == 1
-    assert f"zone artery: {zone['file']}: " in notes[0]
+    assert len(notes) == 2
+    assert all(f"zone artery: {zone['file']}: " in note for note in notes)
 
 
 @pytest.mark.parametrize("record", [PLAN, INSERTION], ids=["plan", "insertion"])

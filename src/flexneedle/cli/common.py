@@ -120,7 +120,8 @@ def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
     scenario = with_controller_defaults(args.load(args), *own, source=source)
     scenario = scenario if args.target is None else with_target(scenario, args.target)
     shown = () if args.image else find_zone_doubts(scenario)  # --image has printed them
-    for line in (*find_unplaced(scenario), *shown):
+    until = " until a registration comes" if getattr(args, "igtl_target", False) else ""
+    for line in (*(f"{line}{until}" for line in find_unplaced(scenario)), *shown):
         warnings.warn(f"{source}: {line}", ScenarioWarning, stacklevel=2)
     return scenario
 

@@ -28,15 +28,27 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     Of a map of entries, draw `entries.png` and `.svg`.
 
     note: called with a line if the record or its trace lacks its end, and for each zone that is not drawn since its
-    file is missing or has changed.
+    file is missing or has changed. A figure that exists is then kept, and the line names it.
 
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
-    for reason in zones_of_record(run.scenario).lost.values():
-        note(f"not drawn: {reason}")
+
+    def save_unless_kept(name: str, make: Callable[[], Figure]) -> list[Path]:
+        lost = [*zones_of_record(run.scenario).lost.values()]
+        old = [path for end in ("png", "svg") if (path := folder / f"{name}.{end}").exists()]
+        if lost and old:
+            kept = " and ".join(map(str, old))
+            note(
+                f"{kept}: kept (move it away to draw it), since a new one would lack zones: {'; '.join(lost)}"
+            )
+            return []
+        for reason in lost:
+            note(f"not drawn: {reason}")
+        return save(make(), folder, name)
+
     if run.kind == "map":
-        return save(entries_figure(read_entries(folder, run.scenario)), folder, "entries")
+        return save_unless_kept("entries", lambda: entries_figure(read_entries(folder, run.scenario)))
     if not run.plans:
         raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")
     is_traced = run.kind == "insertion" and (folder / TRACE_FILE).exists()
@@ -44,8 +56,8 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     if lacking:
         note(lacking)
     if insertion is not None and insertion.periods:
-        return save(insertion_figure(run.scenario, insertion), folder, "insertion")
-    return save(plan_figure(run.scenario, list(run.plans.values())), folder, "plan")
+        return save_unless_kept("insertion", lambda: insertion_figure(run.scenario, insertion))
+    return save_unless_kept("plan", lambda: plan_figure(run.scenario, list(run.plans.values())))
 
 
 def plot(record: Plan | Insertion, width_mm: float = 25.4 * WIDTH) -> Figure:

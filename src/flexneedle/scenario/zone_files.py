@@ -26,7 +26,7 @@ def stamp_of(zone: Zone) -> tuple[int, int] | None:
     if digest != zone.sha256:
         raise InputError(
             f"zone {zone.name}: {path}: has changed since the scenario was made (sha256 {digest}); "
-            "plan again with the scenario that names it"
+            "write the scenario again (flexneedle image show CASE, or without this sha256)"
         )
     return stamp
 

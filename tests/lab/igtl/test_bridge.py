@@ -4,6 +4,7 @@ import json
 import socket
 import subprocess
 import sys
+from argparse import Namespace
 from dataclasses import replace
 from threading import Thread
 
@@ -13,7 +14,8 @@ import pytest
 import flexneedle
 from commands import run
 from emulated import DEADLINE_S, until
-from flexneedle.errors import RunError, StoppedError
+from flexneedle.cli.common import choose_scenario
+from flexneedle.errors import RunError, ScenarioWarning, StoppedError
 from flexneedle.lab.igtl.bridge import IgtlBridge
 from flexneedle.lab.igtl.settings import IgtlAddress, IgtlSettings
 from flexneedle.lab.images.frames import ImageRegistration
@@ -227,6 +229,16 @@ def test_a_port_that_is_taken_is_one_line(port, tmp_path, capsys, monkeypatch):
 def test_options_that_contradict_each_other_are_refused(capsys, options, key):
     status, _, error = run(capsys, "insert", "phantom", *options)
     assert (status, error.startswith(f"flexneedle: {key}")) == (2, True), error
+
+
+@pytest.mark.parametrize("awaits", [False, True])
+def test_zones_in_files_are_in_the_needles_frame_until_a_registration_comes(awaits):
+    zone = {"shape": "file", "name": "artery", "file": "artery.stl"}
+    scenario = SPACE.with_values({"zone": [zone]})
+    args = Namespace(image="case", load=lambda _: scenario, target=None, igtl_target=awaits)
+    end = "until a registration comes" if awaits else "needle's frame"
+    with pytest.warns(ScenarioWarning, match=f"{end}$"):
+        choose_scenario(args)
 
 
 # The command in a process

@@ -84,14 +84,14 @@ def test_a_registration_is_forwarded_once_and_geometry_is_in_the_image_of_the_in
     assert node.registration is None
 
 
-def test_a_target_is_forwarded_while_it_is_awaited_with_what_came_before_it(node):
+def test_points_are_forwarded_while_a_target_is_awaited_with_the_last_registration(node):
     node.receive(registered())
     (note,) = node.receive(points(Target=(0.0, 0.0, 5.0)))
     assert note.text == f"POINT 'F' of {PEER}: ignored, no target is awaited"
     node.take(TargetWait())
-    assert node.receive(points(entry=(1.0, 1.5, 7.0))) == []
-    sent = PeerGeometry(PEER, IMAGE, (1.0, -28.5, 7.0), (1.0, 1.5, 7.0))
-    assert node.receive(points(target=(1.0, -28.5, 7.0))) == [sent]
+    entry = PeerGeometry(PEER, IMAGE, entry=(1.0, 1.5, 7.0))
+    assert node.receive(points(entry=(1.0, 1.5, 7.0))) == [entry]
+    sent = PeerGeometry(PEER, IMAGE, (1.0, -28.5, 7.0))
     assert node.receive(points(target=(1.0, -28.5, 7.0))) == [sent]
     node.take(InsertionBegin(IMAGE))
     node.receive(points(Target=(0.0, 0.0, 5.0)))

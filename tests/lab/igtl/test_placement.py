@@ -8,7 +8,7 @@ import pytest
 import flexneedle
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.geometry.quaternion import from_vector, to_matrix
-from flexneedle.lab.igtl.placement import distance_between, place
+from flexneedle.lab.igtl.placement import Placement, Placer, distance_between
 from flexneedle.lab.igtl.records import PeerGeometry
 from flexneedle.lab.images.case_import import import_case
 from flexneedle.lab.images.frames import ImageRegistration, registration_of
@@ -37,6 +37,10 @@ def unplaced(case):
     values = case.values()
     del values["image"]
     return type(case).from_values(values)
+
+
+def place(scenario, received, entry_radius=np.inf):
+    return Placer(entry_radius).place(scenario, received)
 
 
 def sent_path(registration=None):
@@ -153,6 +157,47 @@ def test_points_that_cannot_be_are_refused():
         place(scenario, PeerGeometry("peer", None, (30.0, 0.0, 0.0), (5.1, 0.0, 0.0)))
     with pytest.raises(ScenarioError):
         scenario.with_values(place(scenario, PeerGeometry("peer", IMAGE, (30.0, 0.0, 0.0))).values)
+
+
+def test_an_entry_is_judged_when_it_arrives_and_counts_for_the_targets_after_it(case):
+    """A refused entry, or one by an earlier registration, does not count."""
+    placer, space = Placer(), load_scenario("phantom3d")
+    entry, target = {"entry": (0.0, 2.0, 1.0)}, {"target": (30.0, 1.0, 0.0)}
+
+    def sent(registration=None, to=space, **points):
+        return placer.place(to, PeerGeometry("peer", registration, **points))
+
+    assert sent(**entry) == Placement({}, ("entry 0, 2, 1 mm, for the next target",))
+    assert sent(**entry) == Placement({}, ())
+    for _ in range(2):
+        placed = sent(**target)
+        assert placed.values["entry.lateral_mm"] == 2.0
+        assert placed.lines == ("target 30, 1, 0 mm, entry received before 0, 2, 1 mm",)
+    assert "entry received before: dropped" in sent(IMAGE).lines[0]
+    assert "entry.lateral_mm" not in sent(IMAGE, **target).values
+    assert sent(**entry, **target) == sent(**entry, **target)
+    with pytest.raises(InputError, match="within 5 mm of the skin"):
+        sent(entry=(9.0, 0.0, 0.0))
+    assert "entry.lateral_mm" not in sent(**target).values
+    with pytest.raises(InputError, match="z must be 0"):
+        sent(to=load_scenario("phantom"), **entry)
+    skin = tuple(registration_of(case).inverse().apply(np.array([0.0, 1.0, 0.0])).tolist())
+    sent(to=case, entry=skin)  # points are by the scenario's registration
+    with pytest.raises(InputError):
+        sent(turned_frame(9.0), to=case)
+    assert sent(IMAGE, to=case, target=tuple(to_ras((44.0, 2.0, 1.0)))).values[
+        "entry.lateral_mm"
+    ] == pytest.approx(1.0)
+
+
+def test_layers_are_said_not_to_be_fitted_again_only_with_a_case(case):
+    aimed = PeerGeometry("peer", None, tuple(to_ras((44.0, 2.0, 1.0))))
+    assert [
+        "not fitted again" in " ".join(place(case, aimed, radius).lines) for radius in (np.inf, 15.0)
+    ] == [
+        False,
+        True,
+    ]
 
 
 def test_rounding_of_32_bits_leaves_a_point_in_the_plane():

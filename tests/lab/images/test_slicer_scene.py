@@ -136,6 +136,8 @@ def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine):
     engine()
     status, out, _ = run(capsys, "image", "example", "abdomen", "--spacing", "2", "2", "2")
     assert (status, len(out.splitlines())) == (0, 3)
+    status, _, err = run(capsys, "image", "example", "abdomen", "--seed", "1")
+    assert (status, "abdomen: already exists and is not an empty folder" in err) == (2, True)
     status, out, _ = run(capsys, "plan", "--image", "abdomen/case.toml", "--out", "planned")
     assert "image (RAS) to needle frame: rotation (w x y z) " in out
     assert "outside of the model's assumptions:\n  skin: tilted by " in out
@@ -145,10 +147,19 @@ def test_the_commands_from_an_image_to_a_scene(capsys, in_tmp, engine):
     status, out, _ = run(capsys, "export", "planned", "--slicer", "scene")
     assert status == 0
     assert out.splitlines()[-1] == "frame: image (LPS in files)"
-    status, shown, _ = run(capsys, "image", "show", "abdomen/case.toml")
-    (in_tmp / "mine.toml").write_text(shown)
-    assert run(capsys, "scenario", "check", "mine.toml")[0] == 0
-    (in_tmp / "abdomen/abdomen.seg.nrrd").unlink()
+    kept = {path: path.read_bytes() for path in (in_tmp / "scene").iterdir()}
+    status, _, err = run(capsys, "export", "planned", "--slicer", "scene")
+    assert (status, "scene: already contains an export" in err) == (2, True)
+    assert {path: path.read_bytes() for path in (in_tmp / "scene").iterdir()} == kept
+    labels = in_tmp / "abdomen/abdomen.seg.nrrd"
+    for _ in range(2):  # a changed label map needs the scenario written again
+        status, shown, _ = run(capsys, "image", "show", "abdomen/case.toml")
+        (in_tmp / "mine.toml").write_text(shown)
+        status, _, err = run(capsys, "scenario", "check", "mine.toml")
+        assert (status, "has changed" in err) == (0, False)
+        labels.write_bytes(labels.read_bytes().replace(b"\n", b"\n# edited\n", 1))
+        assert "flexneedle image show CASE" in run(capsys, "scenario", "check", "mine.toml")[2]
+    labels.unlink()
     status, _, err = run(capsys, "export", "planned", "--slicer", "without")
     assert (status, "not written: zone ribs: " in err) == (0, True)
     kept = {path.name for path in (in_tmp / "scene").iterdir() if not path.name.startswith("zone-")}

@@ -47,6 +47,19 @@ def test_a_target_is_edited_with_entry_and_registration():
     assert edit(PATH, PATH) == found
 
 
+def test_an_entry_waits_for_the_next_target_and_then_is_edited_as_any():
+    entry, *aims = (
+        *(PeerGeometry("peer", None, None, (0.0, 2.0, 1.0)),),
+        *(PeerGeometry("peer", None, (30.0, y, 0.0)) for y in (1.0, 2.0)),
+    )
+    edits = ReceivedEdits(Live(), math.inf)
+    assert edits.edit(SESSION, entry)[0] is SESSION
+    first, _ = edits.edit(SESSION, aims[0])
+    assert first.scenario.entry.lateral_mm == 2.0
+    second, _ = edits.edit(first.edit_scenario({"entry.lateral_mm": 0.0}), aims[1])
+    assert (second.scenario.entry.lateral_mm, second.scenario.target.lateral_mm) == (0.0, 2.0)
+
+
 def test_a_registration_alone_is_edited_and_another_one_is_refused(capsys):
     (found, other) = (
         edit(PeerGeometry("peer", IMAGE), *more) for more in ((), [PeerGeometry("peer", SHIFTED)])

@@ -3,7 +3,9 @@
 import json
 import re
 from dataclasses import replace
+from math import nan
 from pathlib import Path
+from types import SimpleNamespace
 
 import pyarrow.parquet as pq
 import pytest
@@ -62,6 +64,13 @@ def test_a_study_writes_tables_to_a_new_folder_and_prints_one(capsys, here, monk
     assert "Planning 100%: 2 of 2 plans" in err
     assert f"Mine: 8 insertions, folder runs/{folder.name}\n" in err
     assert "\x1b" not in out + err
+
+
+def test_margins_are_entered_by_no_number_of_insertions_that_did_not_run():
+    zones = SimpleNamespace(entered=0, count=3, least_clearance_mm=nan, has_clearances=False)
+    assert study_command._format_zones(zones) == ("–", "–")
+    ran = SimpleNamespace(entered=0, count=3, least_clearance_mm=1.0, has_clearances=True)
+    assert study_command._format_zones(ran) == ("1.000", "0 of 3")
 
 
 @pytest.mark.usefixtures("here")

@@ -222,7 +222,8 @@ def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
 
 
 def _format_zones(group: SettingGroup) -> Sequence[str]:
-    return _number(group.least_clearance_mm), f"{group.entered} of {group.count}"
+    entered = f"{group.entered} of {group.count}" if group.has_clearances else "–"
+    return _number(group.least_clearance_mm), entered
 
 
 def _label(levels: Mapping[str, str], varied: Sequence[str]) -> str:

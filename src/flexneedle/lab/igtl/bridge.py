@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, InputError, one_line
-from flexneedle.lab.igtl.placement import place
+from flexneedle.lab.igtl.placement import Placer
 from flexneedle.lab.igtl.records import InsertionBegin, InsertionResult, NodeSetup, PeerGeometry, TargetWait
 from flexneedle.lab.igtl.settings import IgtlSettings
 from flexneedle.lab.images.frames import registration_of
@@ -49,6 +49,7 @@ class IgtlBridge(LinkBridge):
     ) -> None:
         self.settings = settings
         self._on_stop: Callable[[str], None] = _ignore
+        self._placer = Placer(settings.entry_radius)
         self._scenario, self._awaits, self._forward = scenario, awaits, forward
         self._placed: Scenario  # with the target that was awaited
         self._over = forward is not None
@@ -142,9 +143,9 @@ class IgtlBridge(LinkBridge):
         scenario = self._scenario
         try:
             if scenario is None or not (self._awaits or self._is_comparable(received)):
-                what = "registration of the image" if received.target is None else "target"
+                what = "target" if received.has_points else "registration of the image"
                 raise InputError(f"{what}: not awaited, the insertion has begun without it")
-            placed = place(scenario, received, self.settings.entry_radius)
+            placed = self._placer.place(scenario, received)
             scenario = scenario.with_values(placed.values)
         except FlexneedleError as error:
             self._note_others(f"{received.source}: refused: {one_line(error)}")
@@ -159,7 +160,7 @@ class IgtlBridge(LinkBridge):
     def _is_comparable(self, received: PeerGeometry) -> bool:
         """Return whether it is a registration that may be the scenario's."""
         has_image = self._scenario is not None and registration_of(self._scenario) is not None
-        return has_image and received.target is None
+        return has_image and not received.has_points
 
     def _stop(self, who: str) -> None:
         if self._over:

@@ -23,7 +23,6 @@ from flexneedle.lab.igtl.requests import PathRequest, StopRequest, read_request
 from flexneedle.lab.images.frames import ImageRegistration
 from flexneedle.lab.link.records import LinkNote, LinkRefusal, LinkStop, NodeHeartbeat, NodeLoss
 from flexneedle.lab.process import MessageChannel, open_channel
-from flexneedle.types import Point
 
 BEAT_S = 0.1
 _STATUS_BEATS = 5  # beats from one STATUS to the next, while nothing is published
@@ -38,7 +37,6 @@ class IgtlNode:
         self._composer = IgtlComposer(setup.epoch, setup.registration)
         self._awaits_target = setup.awaits
         self._registration: ImageRegistration | None = None  # the one received last
-        self._entry: Point | None = None
         self._refused, self._refused_at = 0, -BEAT_S
         self._noted: set[tuple[str, str]] = set()
         address = setup.settings.address
@@ -84,7 +82,7 @@ class IgtlNode:
         """Publish a record."""
         match record:
             case InsertionBegin(registration):
-                self._awaits_target, self._entry = False, None
+                self._awaits_target = False
                 self._noted.clear()
                 self._composer.begin(registration)
             case TargetWait():
@@ -128,9 +126,7 @@ class IgtlNode:
             return
         if path == PathRequest(None, None):
             raise InputError("no point is named Target or Entry")
-        self._entry = path.entry or self._entry
-        if path.target is not None:
-            self._channel.send(PeerGeometry(peer, self._registration, path.target, self._entry))
+        self._channel.send(PeerGeometry(peer, self._registration, path.target, path.entry))
 
     def _refuse(self, peer: str, reason: str) -> None:
         """Report a refusal, unless it follows another one soon, as in a flood of messages."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -32,29 +32,64 @@ class Placement:
     lines: tuple[str, ...]
 
 
-def place(scenario: Scenario, received: PeerGeometry, entry_radius: float = math.inf) -> Placement:
-    """Return what is received as values of a scenario, whose section `image` counts if it is set.
+class Placer:
+    """Places what peers send. An entry counts for the targets after it, unless it is refused or the frame changes.
 
-    entry_radius: largest distance (mm) of an entry from the axis in a scenario with an image. Raises InputError for
-    another registration than the scenario's without a target by it, and for points that are too far.
+    entry_radius: largest distance (mm) of an entry from the axis, inf without a case by an image.
     """
+
+    def __init__(self, entry_radius: float = math.inf) -> None:
+        self._radius = entry_radius
+        self._last: PeerGeometry | None = None  # an entry alone
+
+    def forget_entry(self) -> None:
+        """Let later targets be without the entry that came before."""
+        self._last = None
+
+    def place(self, scenario: Scenario, received: PeerGeometry) -> Placement:
+        """Return what is received as values of a scenario, whose section `image` counts if it is set.
+
+        Raises InputError for another registration than the scenario's without a target by it, and for points that are
+        too far.
+        """
+        last = self._last
+        moved: tuple[str, ...] = ()
+        if last == received:  # a peer may repeat an entry
+            return Placement({}, ())
+        if last and registration_of(scenario) is None and last.registration != received.registration:
+            last, moved = None, ("entry received before: dropped, since the registration is new",)
+        self._last = None if received.entry else last
+        placed = _place(scenario, received, self._radius, None if last is None else last.entry)
+        if received.entry:
+            self._last = replace(received, target=None)
+        return Placement(placed.values, (*moved, *placed.lines))
+
+
+def _place(
+    scenario: Scenario, received: PeerGeometry, entry_radius: float, earlier: Point | None
+) -> Placement:
+    """Return values of a registration, or of a target with the received or an earlier entry."""
     own = registration_of(scenario)
     registration = own or received.registration
     values = _image_values(registration) if own is None and registration is not None else {}
-    if received.target is None:
+    if not received.has_points:
         return Placement(values, (_describe_registration(own, received.registration),))
+    given = received.entry or earlier
+    entry = (0.0, scenario.entry.lateral_mm, scenario.entry.lateral_z_mm)
+    shown = ""
+    if given is not None:
+        entry = _to_needle(scenario, registration, given)
+        _check_entry(scenario, entry, entry_radius)
+        shown = f"entry {'' if received.entry else 'received before '}{_to_text(entry)} mm"
+    if received.target is None:
+        return Placement({}, (f"{shown}, for the next target",))
     lines = [*_describe_image(scenario)] if values else []
     target = _to_needle(scenario, registration, received.target)
     values |= dict(zip(("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"), target, strict=True))
-    shown = f"target {_to_text(target)} mm"
-    entry = (0.0, scenario.entry.lateral_mm, scenario.entry.lateral_z_mm)
-    if received.entry is not None:
-        entry = _to_needle(scenario, registration, received.entry)
-        fitted = max(0.0, entry_radius - scenario.entry.free_radius_mm)
-        _check_entry(entry, math.inf if own is None else fitted)
+    if given is not None:
         values |= {"entry.lateral_mm": entry[1], "entry.lateral_z_mm": entry[2]}
-        shown += f", entry {_to_text(entry)} mm"
-    return Placement(values, (*lines, shown, *_doubts(entry, target, has_image=own is not None)))
+    points = ", ".join(filter(None, (f"target {_to_text(target)} mm", shown)))
+    return Placement(values, (*lines, points, *_doubts(entry, target, fitted=math.isfinite(entry_radius))))
 
 
 def distance_between(one: ImageRegistration, other: ImageRegistration) -> float:
@@ -100,7 +135,7 @@ def _to_needle(scenario: Scenario, registration: ImageRegistration | None, point
     return x, y, 0.0 if scenario.setup.axes == 1 and abs(z) <= _ROUNDING_MM else z
 
 
-def _check_entry(entry: Point, radius: float) -> None:
+def _check_entry(scenario: Scenario, entry: Point, entry_radius: float) -> None:
     """Raise InputError for an entry in the needle's frame that is far from the skin, or from where it was fitted."""
     x, y, z = entry
     opening = f"entry {_to_text(entry)} mm in the needle's frame"
@@ -108,6 +143,9 @@ def _check_entry(entry: Point, radius: float) -> None:
         raise InputError(
             f"{opening}: must be within {FAR_FROM_SKIN_MM:g} mm of the skin (x = 0): is the registration right?"
         )
+    if scenario.setup.axes == 1 and z != 0.0:
+        raise InputError(f"{opening}: z must be 0 with setup.axes = 1")
+    radius = max(0.0, entry_radius - scenario.entry.free_radius_mm)
     if (off := math.hypot(y, z)) > radius:
         raise InputError(
             f"{opening}: {off:.1f} mm from the entry of the case: must be within its skin_radius_mm less "
@@ -115,12 +153,12 @@ def _check_entry(entry: Point, radius: float) -> None:
         )
 
 
-def _doubts(entry: Point, target: Point, *, has_image: bool) -> Iterator[str]:
+def _doubts(entry: Point, target: Point, *, fitted: bool) -> Iterator[str]:
     """Yield what the import of an image checks for its own points, and what is left of a received entry."""
     (depth, *off), (at, *way) = entry, target
     if abs(depth) > SAME_MM:
         yield f"entry: {abs(depth):.2g} mm {'below' if depth > 0.0 else 'above'} the skin, taken on it"
-    if has_image:
+    if fitted:
         angle = math.degrees(math.atan2(math.dist(off, way), at))
         yield (
             f"outside of the model's assumptions: skin and layers are of the axis, {math.hypot(*off):.1f} mm "

@@ -42,7 +42,7 @@ class InsertionResult:
 
 @dataclass(frozen=True)
 class PeerGeometry:
-    """A registration of a peer, or a target by it.
+    """A registration of a peer, or points by it.
 
     Attributes:
         source: The peer.
@@ -54,3 +54,8 @@ class PeerGeometry:
     registration: ImageRegistration | None = None
     target: Point | None = None
     entry: Point | None = None
+
+    @property
+    def has_points(self) -> bool:
+        """Whether it has a target or an entry."""
+        return self.target is not None or self.entry is not None

@@ -48,10 +48,12 @@ segment = "vessels"
 def write_example(folder: Path, seed: int, spacing: tuple[float, float, float]) -> list[Path]:
     """Write label map, points and case of the abdomen of a seed; return their paths.
 
-    Raises InputError if the folder cannot be created, RecordError if a file cannot be written.
+    Raises InputError for a folder that is not empty or cannot be created, RecordError if a file cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise InputError(f"{folder}: already exists and is not an empty folder: choose another folder")
     except OSError as error:
         raise InputError(f"{folder}: cannot be created: {error.strerror}") from None
     made, paths = make_abdomen(seed, spacing), [folder / name for name in (LABELS, POINTS, CASE)]

@@ -32,7 +32,8 @@ def write_scene(run: Insertion | dict[str, Plan], folder: Path) -> list[Path]:
     """Write the files of an insertion, or of plans by strategy, in the frame of the scenario's image; return them.
 
     The frame is the needle's if the scenario has no image. A zone is left out if its file is missing or has changed.
-    Raises InputError for a folder that cannot be created, RecordError if a file cannot be written.
+    Raises InputError for a folder that contains an export or cannot be created, RecordError if a file cannot be
+    written.
     """
     plans = {run.plan.strategy: run.plan} if isinstance(run, Insertion) else run
     scenario = _scenario_of(run, next(iter(plans.values())))
@@ -58,13 +59,16 @@ def _describe_entry(found: EntryMap, entry: int) -> str:
 def _write(
     scenario: Scenario, markups: Sequence[Markup], meshes: dict[str, Mesh], folder: Path
 ) -> list[Path]:
-    """Write markups, meshes, zones and the transform to the image's frame."""
+    """Write the transform to the image's frame, markups, meshes and zones."""
     to_image = image_frame(scenario).inverse()
     path = check_path("folder", folder)
+    if (path / TRANSFORM).exists():  # its zones and paths would be beside these
+        raise InputError(f"{path}: already contains an export ({TRANSFORM}): choose another folder")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be created: {error.strerror}") from None
+    write_transform(matrix(to_image), path / TRANSFORM)
     names = [f"{_plain(each.name)}.mrk.json" for each in markups]
     for name, markup in zip(
         names, markups, strict=True
@@ -73,7 +77,6 @@ def _write(
     meshes = {**meshes, **dict(_zones(scenario))}
     for name, mesh in meshes.items():
         write_mesh(Mesh(to_image.apply(mesh.points), mesh.triangles), path / name)
-    write_transform(matrix(to_image), path / TRANSFORM)
     return [path / name for name in (*names, *meshes, TRANSFORM)]
 
 
