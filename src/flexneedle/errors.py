@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+TO_INSERT_ANYWAY = "; to insert anyway: flexneedle insert --force (force=True)"
+"""Advice at the end of a reason not to insert."""
+
 
 class FlexneedleError(Exception):
     """Base class of all errors that flexneedle raises."""

@@ -44,7 +44,7 @@ def test_without_a_path_the_needle_is_held_and_the_insertion_aborted_with_the_re
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss +3.000 ± 0.100 mm is beyond")
     assert "control.miss_limit_mm = 2 " in done.reason
-    assert done.reason.endswith("to insert anyway: flexneedle insert --force")
+    assert done.reason.endswith("to insert anyway: flexneedle insert --force (force=True)")
     assert done.summary.endswith(done.reason)
     assert len(recorded.moves) == 5
     stopped = [period for period in done.periods if period.decision.startswith(HELD)]

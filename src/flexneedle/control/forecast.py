@@ -6,6 +6,7 @@ import math
 from scipy.special import chndtr
 
 from flexneedle.control.interface import Decision
+from flexneedle.errors import TO_INSERT_ANYWAY
 from flexneedle.results import TARGET_RADIUS_MM, format_mm
 from flexneedle.scenario.sections.settings import ControlSettings
 
@@ -44,7 +45,7 @@ def reason_to_hold(decision: Decision, control: ControlSettings) -> str:
     return (
         f"no path to the target found: predicted miss {_format_prediction(decision)} is beyond "
         f"control.miss_limit_mm = {limit:g} with a probability of {probability:.3f} "
-        f"(limit {control.miss_confidence:.3f}); to insert anyway: flexneedle insert --force"
+        f"(limit {control.miss_confidence:.3f}){TO_INSERT_ANYWAY}"
     )
 
 

@@ -11,7 +11,7 @@ from flexneedle.control import controller_tables
 from flexneedle.control.controllers import DEFAULT, with_controller_defaults
 from flexneedle.control.interface import Controller
 from flexneedle.control.limits import check_guide
-from flexneedle.errors import RunError
+from flexneedle.errors import TO_INSERT_ANYWAY, RunError
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.closed_loop import run
 from flexneedle.loop.events import Ended, Gate, Stream
@@ -108,7 +108,7 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
     if fails and not choices.force:
         missed = f"misses the target by {format_mm(plan.error_mm)} (limit {format_mm(TARGET_RADIUS_MM)}), limited by"
         why = plan.summary if plan.refusal else f"{missed} {plan.limit}"
-        raise RunError(f"plan {why}; to insert anyway: flexneedle insert --force (force=True)")
+        raise RunError(f"plan {why}{TO_INSERT_ANYWAY}")
     task = controller_tables.make_task(
         chosen, Simulator(with_controller_defaults(scenario, chosen), choices.threads), plan
     )

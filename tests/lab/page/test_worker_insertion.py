@@ -175,11 +175,13 @@ def test_a_stop_ends_it_as_interrupted_and_a_cancel_without_a_result(change):
         worker.save(task("save", folder="nowhere"))
 
 
-def test_a_refused_insertion_is_reported():
+def test_a_refused_insertion_is_reported_without_advice_that_the_page_cannot_follow():
     scenario = short(**{"target.lateral_mm": 12.0})
     reported = done(InsertionJobs().insert, task("insert", "insertion", scenario, controller="ce-mpc"))
     assert reported.of("insertion")[-1].state == "refused"
-    assert "misses the target" in reported.of("insertion")[-1].summary
+    summary = reported.of("insertion")[-1].summary
+    assert "misses the target" in summary
+    assert "--force" not in summary
 
 
 def test_an_insertion_is_listed_once_it_is_completely_saved_and_is_read_again(

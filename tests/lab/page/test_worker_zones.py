@@ -72,6 +72,7 @@ def test_a_recording_has_zones_after_the_insertion_and_the_nearest_in_each_row()
     rows = reports[-1].rows
     assert rows[0]["nearest"] is None  # before the skin
     assert rows[-1]["nearest"]["zone"] == "node"
+    assert {each["margin_mm"] for each in rows} == {2.0}
 
 
 def test_a_recording_names_a_zone_whose_file_is_missing_without_its_path():

@@ -7,8 +7,9 @@ are sent as null.
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from flexneedle.errors import TO_INSERT_ANYWAY
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.zones import Zone
 
@@ -20,6 +21,14 @@ JobKind = Literal[
 ]  # fmt: skip
 Vector = tuple[float, float, float]
 TargetName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^\S([^\x00-\x1f]*\S)?$")]
+
+
+def without_advice(text: str) -> str:
+    """Return a text without the advice to insert with `--force`, which the page does not have."""
+    return text.replace(TO_INSERT_ANYWAY, "")
+
+
+Reason = Annotated[str, AfterValidator(without_advice)]
 
 
 class ProtocolMessage(BaseModel):
@@ -180,7 +189,7 @@ class JobMessage(ServerMessage):
     kind: JobKind
     state: Literal["waiting", "running", "done", "failed", "cancelled"]
     share: float | None = None
-    text: str = ""
+    text: Reason = ""
 
 
 class EstimateMessage(ServerMessage):
@@ -255,7 +264,8 @@ class ReachMessage(ServerMessage):
 class RowsMessage(ServerMessage):
     """Rows of an insertion's periods from `first` on, in order. of: "live", "first" or "second" recording.
 
-    A row has the keys of `record.fields.page_values`; with zones also `nearest`, the estimated needle's `NearestZone`.
+    A row has the keys of `record.fields.page_values`; with zones also `margin_mm`, the least margin, and `nearest`, the
+    estimated needle's `NearestZone`.
     """
 
     by = "of"
@@ -287,7 +297,7 @@ class InsertionMessage(ServerMessage):
     of: Literal["live", "first", "second"]
     name: str
     state: str
-    summary: str
+    summary: Reason
     controller: str
     seed: int
     target: Vector
@@ -370,7 +380,7 @@ class StudyRow(ProtocolMessage):
     target: Vector
     error_mm: float | None
     outcome: str
-    reason: str
+    reason: Reason
     opens: bool
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from browser_checks import BAR, FOCUSED, arrived, click_button
 from fake_page import until
-from flexneedle.lab.page.protocol import DisturbancesMessage, RowsMessage
-from recorded_page import clients, insertion, load, opening, row, rows, session
+from flexneedle.lab.page.protocol import DisturbancesMessage, JobMessage, RowsMessage
+from recorded_page import clients, insertion, load, opening, plan, row, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -33,6 +33,18 @@ def test_an_insertion_is_started_and_can_only_be_stopped_before_it_moves(panel, 
         until(page, f"{FOCUSED} === 'Stop'")
         assert page.locator(f"{BAR} button:visible:enabled").all_inner_texts() == ["Plan", "Stop"]
         assert page.is_disabled("[aria-label=Pace]")
+
+
+def test_a_refusal_is_shown_until_a_later_plan_reaches_the_target(panel, server):
+    refused = JobMessage(job=4, kind="insertion", state="failed", text="plan misses the target")
+    page = panel([*opening(), plan(), insertion("refused", periods=0, pace=0.0), refused])
+    page.wait_for_selector("footer >> text=plan misses the target")
+    server.send(JobMessage(job=5, kind="plan", state="done"), plan(reached=False))
+    arrived(page)
+    assert page.is_visible("footer >> text=plan misses the target")
+    server.send(JobMessage(job=6, kind="plan", state="done"), plan())
+    arrived(page)
+    assert not page.is_visible("footer >> text=plan misses the target")
 
 
 def test_a_running_insertion_is_paused_stepped_paced_and_stopped(panel, server):

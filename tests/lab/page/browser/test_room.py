@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from browser_checks import arrived
-from recorded_page import opening, scene
+from recorded_page import insertion, opening, period_frames, rows, scene
 
 pytestmark = pytest.mark.page
 
@@ -73,6 +73,10 @@ def test_layers_and_grid_are_to_scale_and_labelled(space, server):
         assert places[f"{depth:.0f}".replace("-", "−")] == [(depth, -half, 1.15 * half)]
     guide = f"async () => {{ {VIEW} return view.shapes.guide.visible; }}"
     assert page.evaluate(guide)
+    server.send(insertion(periods=51), *period_frames(50), rows(0, 51))
+    arrived(page)
+    assert labels(page)["guide"] == [(-41.0, 2.5 + 1.0, 0.5)]  # with the guide
+    page.evaluate("flexneedle.store.set('view of', 'scene')")
     server.send(scene().model_copy(update={"guide": None}))
     arrived(page)
     assert not page.evaluate(guide)

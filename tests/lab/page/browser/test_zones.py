@@ -6,15 +6,20 @@ import pytest
 from browser_checks import arrived, painted
 from fake_page import until
 from flexneedle.lab.page.protocol import RowsMessage
+from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import (
     NEAREST,
+    TARGET,
     ZONE,
     cube,
     insertion,
+    needle,
     opening,
+    period_frames,
     plan,
     plan_frames,
     row,
+    rows,
     scene,
     session,
     zones,
@@ -62,9 +67,11 @@ def legend(page, panel):
     return page.locator(f"{panel} .legend li").all_inner_texts()
 
 
-LOOPS = """async ([surface, offset, e]) => {
+LOOPS = """async ([surface, offset, e, needle]) => {
   const { loopsOf } = await import("/static/flat/zones.js");
-  return loopsOf(surface, offset, { point: [0, 0], slope: [0, 0], e });
+  const { besideOf } = await import("/static/flat/plane.js");
+  const plane = { point: [0, 0], slope: [0, 0], e };
+  return loopsOf(surface, offset, plane, besideOf(plane, needle));
 }"""
 
 
@@ -75,11 +82,43 @@ def test_a_plane_cuts_a_surface_in_closed_curves(section):
         ([0, 0, -1], [1, 0], (18.0, 4.0), (22.0, 8.0)),
         ([1, -6, 0], [0, 1], (19.0, 0.0), (23.0, 4.0)),
     ):
-        (loop,) = (np.array(each) for each in page.evaluate(LOOPS, [surface, offset, e]))
+        (loop,) = (np.array(each) for each in page.evaluate(LOOPS, [surface, offset, e, []]))
         np.testing.assert_allclose([loop.min(axis=0), loop.max(axis=0)], [low, high], atol=1e-9)
         area = 0.5 * np.sum(loop[:, 0] * np.roll(loop[:, 1], -1) - np.roll(loop[:, 0], -1) * loop[:, 1])
         assert abs(area) == pytest.approx(16.0)
-    assert page.evaluate(LOOPS, [surface, [0, 0, 0.5], [1, 0]]) == []
+    assert page.evaluate(LOOPS, [surface, [0, 0, 0.5], [1, 0], []]) == []
+
+
+def test_a_zone_is_cut_through_the_needle_depth_by_depth(section):
+    """Of a cube with z from 0 to 4 mm what is deeper than 20 mm, where the needle is at z = 0."""
+    page, surface = section(prepared()), cube(ZONE, 2.0).model_dump()
+    needle = [[0, 9, -20], [15, 9, -5], [40, 9, 20]]
+    (loop,) = (np.array(each) for each in page.evaluate(LOOPS, [surface, [0, 0, 0], [1, 0], needle]))
+    np.testing.assert_allclose([loop.min(axis=0), loop.max(axis=0)], [(20.0, 4.0), (22.0, 8.0)], atol=1e-9)
+    beside = [[[0, 9, z]] for z in (-1, 5)]
+    assert [page.evaluate(LOOPS, [surface, [0, 0, 0], [1, 0], each]) for each in beside] == [[], []]
+
+
+CUT = """async (of) => {
+  const { cutAlong } = await import("/static/planned.js");
+  return cutAlong(flexneedle.store, of);
+}"""
+
+
+def test_zones_are_cut_along_the_plan_and_along_an_insertion_and_what_it_has_planned(section, server):
+    page = section(prepared())
+    assert page.evaluate(CUT, "scene") == []
+    server.send(*plan_frames(), plan())
+    arrived(page)
+    np.testing.assert_allclose(page.evaluate(CUT, "scene"), needle(40.0, sway=0.4), atol=1e-5)
+    server.send(
+        insertion("running", periods=51), *plan_frames(FrameSource.LIVE), *period_frames(50), rows(0, 51)
+    )
+    arrived(page)
+    cut, estimated = np.array(page.evaluate(CUT, "live")), np.array(row(50)["estimate"])
+    assert (np.diff(cut[:, 0]) > 0.0).all()
+    assert np.abs(cut - estimated).max(axis=1).min() < 1e-5
+    np.testing.assert_allclose(cut[-1], TARGET, atol=1e-5)
 
 
 def test_zone_and_entry_are_moved_in_the_plane_of_the_section(section, server, pictures):

@@ -20,6 +20,11 @@ export function pathAt(shape, index) {
   return known.get(index);
 }
 
+// Points [x, y, z] of a path; none without one.
+export function pointsIn(path) {
+  return Array.from({ length: path?.points ?? 0 }, (_, at) => [...path.values.subarray(at * path.columns, at * path.columns + 3)]);
+}
+
 // Last point (x, y, z) of a path.
 export function tipOf({ values, points, columns }) {
   const at = (points - 1) * columns;

@@ -1,7 +1,7 @@
 // The plan, or its first estimate while the present scenario has no plan: the path of the tip, the needle at the target,
 // and the roll at the start, for all views.
 
-import { first, fresh, last } from "./paths.js";
+import { first, fresh, last, pointsIn } from "./paths.js";
 import { isStale, shownRow, shownShape } from "./shown.js";
 
 const STRATEGIES = ["manipulation", "steering"];
@@ -38,6 +38,15 @@ export function foreseen(store, of) {
   const path = of === "scene" ? last(shape) : first(shape);
   if (path?.columns > 3) return { path, text: "predicted needle at the target ± 2 sd", spread: 2 };
   return { path, text: `needle at the target, ${estimated ? "first estimate" : "planned"}`, spread: 0 };
+}
+
+// Points [x, y, z] of the curve through which sections cut the zones: the planned needle at the target; of an insertion its needle
+// and, beyond the tip, the planned path.
+export function cutAlong(store, of) {
+  const path = plannedPaths(store, of).chosen?.path;
+  if (of === "scene") return pointsIn(foreseen(store, of).path ?? path);
+  const needle = pointsIn(first(shownShape(store, "needle", of)));
+  return [...needle, ...pointsIn(path).filter(([x]) => x > (needle.at(-1)?.[0] ?? -Infinity))];
 }
 
 // Roll (deg) at the shown period; before the first the plan's.

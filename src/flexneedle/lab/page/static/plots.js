@@ -22,6 +22,7 @@ const PLOTS = [
   { title: "Clearance from zones (mm)", none: "There are no zones to avoid.", lines: [
     { name: "estimated", tone: "--estimate", of: (row) => row.clearance_mm },
     { name: "true", tone: "--true", of: (row) => row.true_clearance_mm, dash: true },
+    { name: "least margin", tone: "--bad", of: (row) => row.margin_mm ?? null, thin: true },
   ] },
   { title: "Guide (mm)", lines: [
     { name: "y", tone: "--guide", of: (row) => row.guide[0] },

@@ -89,7 +89,7 @@ class SectionView {
     const parts = partsOf(this.#store, scene);
     const [zones, near] = [shownZones(this.#store), shownNearest(this.#store)];
     const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, others, parts, outline, zones, near, store: this.#store });
-    showLegend(this.#legend, [...entriesOf([...parts, ...measuredTip(this.#store)], reached), ...zoneEntries(zones, near)], others);
+    showLegend(this.#legend, [...entriesOf([...parts, ...measuredTip(this.#store)], reached), ...zoneEntries(zones, near, scene.axes === 2)], others);
     this.#handles.update(mayMove(this.#store) ? [...this.#handlesOf({ map, plane, layers, guide, target, height }), ...this.#zoneHandles({ map, plane, zones })] : []);
   }
 

@@ -2,7 +2,7 @@
 
 import { button, make, renew } from "./dom.js";
 import { waits } from "./rig.js";
-import { ENDED, isPrepared } from "./shown.js";
+import { ENDED, isPrepared, isStale } from "./shown.js";
 
 const CONNECTIONS = {
   connecting: "Connecting…",
@@ -85,12 +85,13 @@ function inControl({ clients, steering }, own) {
   return `${all}, ${steering === null ? "nobody is" : mine ? "you are" : `person ${steering} is`} in control`;
 }
 
-// Work that takes longer than a second has a bar; a failure stays until the next job of its kind begins.
+// Work that takes longer than a second has a bar; a failure stays until the next job of its kind begins, the refusal of an insertion
+// until a later plan reaches the target.
 function followJobs(element, store, link) {
   const entries = new Map(); // by kind
-  store.subscribe(["job ", "rig", "insertion live"], () => {
+  store.subscribe(["job ", "rig", "insertion live", "plan "], () => {
     const kinds = new Set([...entries.keys(), ...store.keys("job ").map((key) => key.slice(4))]);
-    for (const kind of kinds) change(kind, store.get(`job ${kind}`));
+    for (const kind of kinds) change(kind, isSettled(store, kind) ? undefined : store.get(`job ${kind}`));
   });
   function change(kind, job) {
     const earlier = entries.get(kind);
@@ -138,6 +139,15 @@ function followJobs(element, store, link) {
     shown.remove();
     entries.delete(kind);
   }
+}
+
+// Return whether an insertion was refused, and a later plan reaches the target.
+function isSettled(store, kind) {
+  if (kind !== "insertion" || store.get("insertion live")?.state !== "refused") return false;
+  const refused = store.get("job insertion")?.job ?? Infinity;
+  const later = ["plan", "compare"].map((each) => store.get(`job ${each}`)).some((job) => job?.state === "done" && job.job > refused);
+  const plan = store.get(`plan ${store.get("session")?.strategy}`);
+  return later && Boolean(plan?.reached) && !isStale(store, plan);
 }
 
 // The newest refusals, each for some seconds or until it is closed; the refusal of a value until the next accepted change.

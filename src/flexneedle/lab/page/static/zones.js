@@ -44,11 +44,12 @@ export function shownNearest(store) {
   return isStale(store, plan) ? null : plan?.nearest ?? null;
 }
 
-// Entries of the legend.
-export function zoneEntries(zones, near) {
+// Entries of the legend. silhouettes: whether they are drawn.
+export function zoneEntries(zones, near, silhouettes = false) {
   const shown = zones.some(({ surface }) => surface.triangles.length);
   return [
     ...(shown ? [{ text: "zone to avoid", tone: "--zone", form: "area" }, { text: "its margin, for the needle's axis", tone: "--zone", form: "dashed" }] : []),
+    ...(shown && silhouettes ? [{ text: "zone, silhouette", tone: "--zone", form: "area", faint: true }] : []),
     ...(near ? [{ text: `least clearance ${clearanceIn(near)} to ${near.zone}`, tone: "--ink", form: "line" }] : []),
   ];
 }

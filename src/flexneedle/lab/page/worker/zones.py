@@ -5,7 +5,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flexneedle.lab.page.protocol import NearestZone, PageZone, ZonesMessage, ZoneSurface, places_of
+from flexneedle.lab.page.protocol import (
+    NearestZone,
+    PageZone,
+    ZonesMessage,
+    ZoneSurface,
+    places_of,
+    without_advice,
+)
 from flexneedle.record.fields import page_values
 from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
@@ -51,9 +58,10 @@ def find_nearest(zones: ZoneMap, shapes: Iterable[Floats], clearance: float) -> 
 
 
 def describe_row(period: Period, plan: Plan, zones: ZoneMap) -> dict[str, Any]:
-    """Return the row of a period, with the nearest zone if there are zones."""
+    """Return the row of a period, with the least margin and the nearest zone if there are zones."""
     row = page_values(period, plan)
+    row["decision"] = without_advice(row["decision"])
     if not zones:
         return row
     near = find_nearest(zones, [period.shape], period.clearance)
-    return row | {"nearest": None if near is None else near.model_dump()}
+    return row | {"margin_mm": zones.margin, "nearest": None if near is None else near.model_dump()}

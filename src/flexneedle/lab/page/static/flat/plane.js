@@ -27,6 +27,17 @@ export function across({ point, slope, e }, x, y, z) {
   return -e[1] * (y - point[0] - slope[0] * x) + e[0] * (z - point[1] - slope[1] * x);
 }
 
+// The function of the depth that is the distance from the plane of a curve of points [x, y, z] in the order of depth; 0 without points.
+export function besideOf(plane, points) {
+  const known = points.map(([x, y, z]) => [x, across(plane, x, y, z)]);
+  return (depth) => {
+    const next = known.findIndex(([x]) => x >= depth);
+    if (next < 1) return known.at(next)?.[1] ?? 0; // before the first, or beyond the last
+    const [[x0, w0], [x1, w1]] = known.slice(next - 1, next + 1);
+    return w0 + ((w1 - w0) * (depth - x0)) / (x1 - x0);
+  };
+}
+
 // The point at x, u that is as far from the plane as another.
 export function lifted(plane, x, u, [fromX, fromY, fromZ]) {
   const { point, slope, e } = plane;

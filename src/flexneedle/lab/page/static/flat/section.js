@@ -1,6 +1,7 @@
 // Draws a section: tissue, grid, reach, guide, target, and moving parts.
 
-import { isMeasured, shownReach, shownRow } from "../shown.js";
+import { cutAlong } from "../planned.js";
+import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
 import { shadeOf } from "../theme.js";
 import { layersIn } from "./layers.js";
 import { FOOT, SIDE, area, cross, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
@@ -28,7 +29,7 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
   inside(pen, width, height, () => {
     drawNames(pen, map, layers, width);
     reached = reach(pen, map, outline);
-    drawZones(pen, map, plane, zones);
+    if (zones.length) drawZones(pen, map, plane, zones, cutAlong(store, shownOf(store)), { silhouettes: scene.axes === 2 });
     for (const part of parts) draw(pen, part, place, map);
     if (near) drawNearest(pen, near, place);
     if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);

@@ -14,7 +14,7 @@ export class Labels {
     this.group.name = "labels";
   }
 
-  // Add a label at a point [x, y, z]. anchor: the part of the text at that point, [0, 0] is its lower left corner.
+  // Add a label at a point [x, y, z] and return it. anchor: the part of the text at that point, [0, 0] is its lower left corner.
   add(text, point, color, anchor = [0.5, 0.5]) {
     const { canvas, width, height } = drawn(text, color);
     const texture = new CanvasTexture(canvas);
@@ -27,6 +27,7 @@ export class Labels {
     sprite.userData = { text, width, height };
     this.group.add(sprite);
     this.#size(sprite);
+    return sprite;
   }
 
   clear() {

@@ -8,6 +8,7 @@ import { shown } from "../dom.js";
 import { color, shadeOf } from "../theme.js";
 
 const STEP = 5; // mm
+const ABOVE = 2.5; // mm, of the guide's label
 
 export class Room {
   constructor(labels) {
@@ -25,7 +26,12 @@ export class Room {
     this.labels.clear();
     this.#addGrid(box);
     for (const layer of scene.layers) this.#addLayer(layer, box);
-    if (scene.guide) this.#label("guide", [scene.guide[0], scene.guide[1] + 2.5, scene.guide[2]], "--guide", [0.5, 0]);
+    this.guide = scene.guide && this.#label("guide", scene.guide, "--guide", [0.5, 0]);
+  }
+
+  // Put the guide's label above the guide.
+  labelGuide({ x, y, z }) {
+    this.guide?.position.set(x, y + ABOVE, z);
   }
 
   #addLayer({ name, top_mm: top, bottom_mm: bottom, shear_modulus_kpa: modulus }, { right, half }) {
@@ -81,7 +87,7 @@ export class Room {
   }
 
   #label(text, point, tone, anchor) {
-    this.labels.add(text, point, color(tone), anchor);
+    return this.labels.add(text, point, color(tone), anchor);
   }
 }
 

@@ -52,6 +52,7 @@ export class SpaceView {
     if (!scene) return;
     this.#updateRoom(scene);
     const entries = [...this.shapes.update(this.#store, scene, shownOf(this.#store)), ...this.zones.update(this.#store)];
+    this.room.labelGuide(this.shapes.guide.position);
     showLegend(this.#legend, entries, otherTargets(this.#store));
     this.target.update();
     this.#later ||= requestAnimationFrame(() => {
