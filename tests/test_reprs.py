@@ -60,4 +60,4 @@ def test_a_state_gives_the_slope_in_mrad():
 def test_a_plan_and_an_insertion_give_the_target_as_the_terminal_does():
     plan = replace(INSERTION.plan, target=(138.126, 2.6789, 0.0))
     for record in (plan, replace(INSERTION, plan=plan)):
-        assert "to (138.126, 2.6789) mm" in repr(record)
+        assert "to (138.126, 2.679) mm" in repr(record)
