@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import flexneedle
 import zone_rooms
 from flexneedle.simulator.zones import zones_of
 
@@ -29,6 +30,15 @@ def test_a_zone_that_is_displaced_towards_the_needle_is_not_touched_without_term
     (row,) = zone_rooms.insert_room((5, True, False), sd=0.0, displaced=9.0, blind=True, draws=1)
     assert row["outcome"] == "held"
     assert row["clearance"] > 0.3
+
+
+def test_a_plan_with_a_bent_needle_ends_where_its_search_says():
+    """It needs more travel than a straight one: the search measures the miss of a tip that is short on its tangent."""
+    scenario = zone_rooms.room(500014, free=False, space=False)
+    plan = flexneedle.plan(scenario.with_values({"image.sd_mm": 0.5}), threads=1)
+    assert plan.hit
+    assert plan.terms["zones"] == 0.0
+    assert plan.error_mm < 0.1
 
 
 def _pair(value):

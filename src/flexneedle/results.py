@@ -130,12 +130,12 @@ class Plan:
 
     @property
     def reached(self) -> bool:
-        """Whether the plan ends within 1 mm of the target (the paper's target circle) and the guard permits it."""
+        """True if the plan ends within 1 mm of the target (the paper's target circle) and the guard permits it."""
         return self.error_mm <= TARGET_RADIUS_MM and not self.refusal
 
     @property
     def hit(self) -> bool:
-        """Whether no limit binds and the target is inside the planned needle: see `is_hit`."""
+        """True if no limit binds and the target is inside the planned needle: see `is_hit`."""
         return not (self.limit or self.refusal) and is_hit(self.error_mm, self.scenario)
 
     @property
@@ -364,12 +364,12 @@ class Insertion:
 
     @property
     def reached(self) -> bool:
-        """Whether the outcome is done and the tip ended within 1 mm of the target, by `error_mm`."""
+        """True if the outcome is done and the tip ended within 1 mm of the target, by `error_mm`."""
         return self.outcome is Outcome.DONE and self.error_mm <= TARGET_RADIUS_MM
 
     @property
     def hit(self) -> bool:
-        """Whether the outcome is done and the target is inside the needle: see `is_hit`."""
+        """True if the outcome is done and the target is inside the needle: see `is_hit`."""
         return self.outcome is Outcome.DONE and is_hit(self.error_mm, self.scenario or self.plan.scenario)
 
     @property

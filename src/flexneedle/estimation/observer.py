@@ -130,7 +130,7 @@ class Corrected:
 
     @property
     def _rests_unread(self) -> bool:
-        """Whether the last move was a rest, and no reading of it has arrived."""
+        """True if the last move was a rest, and no reading of it has arrived."""
         return bool(self.moves) and self.moves[-1].applied == STILL and not self.moves[-1].measurements
 
     def observe(self, measurements: Sequence[Measurement]) -> "Corrected":

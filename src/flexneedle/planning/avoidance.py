@@ -123,7 +123,7 @@ class _Tries:
 
     @property
     def found(self) -> bool:
-        """Whether the best plan keeps all margins and reaches its target precisely."""
+        """True if the best plan keeps all margins and reaches its target precisely."""
         return self.best is not None and self.best.plan.hit and self.best.plan.error_mm <= PRECISE_MM
 
 

@@ -145,7 +145,7 @@ class RigConnection(LinkedConnection):
 
     @property
     def _asks(self) -> bool:
-        """Whether motions of motors are confirmed on the terminal: unless --yes is given or ROS arms the rig."""
+        """True if motions of motors are confirmed on the terminal: unless --yes is given or ROS arms the rig."""
         ros = self._file.ros
         return self._rig.moves and not (self.args.yes or (ros is not None and ros.arm))
 

@@ -57,5 +57,5 @@ class PeerGeometry:
 
     @property
     def has_points(self) -> bool:
-        """Whether it has a target or an entry."""
+        """True if it has a target or an entry."""
         return self.target is not None or self.entry is not None

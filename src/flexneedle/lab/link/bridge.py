@@ -105,7 +105,7 @@ class LinkBridge(Gate):
 
     @property
     def _stops_if_lost(self) -> bool:
-        """Whether the loss of the node stops the rig."""
+        """True if the loss of the node stops the rig."""
         return False
 
     # The insertion

@@ -62,7 +62,7 @@ class SettingGroup:
 
     @property
     def has_clearances(self) -> bool:
-        """Whether a clearance from a zone to avoid is known."""
+        """True if a clearance from a zone to avoid is known."""
         return not isnan(self.least_clearance_mm)
 
 
