@@ -144,7 +144,7 @@ def test_what_an_import_checks_is_named_with_its_size_and_an_entry_beyond_its_sk
     entry, target = own.inverse().apply(np.array([[-1.25, 3.0, 4.0], [40.0, 3.0, 11.0]])).tolist()
     *_, depth, doubt = place(case, PeerGeometry("peer", None, tuple(target), tuple(entry)), 16.0).lines
     assert depth == "entry: 1.2 mm above the skin, taken on it"
-    assert "5.0 mm from the entry, at an angle of 9.9 degrees" in doubt  # atan 7/40
+    assert "5.0 mm from this entry, at 9.9 degrees to the line" in doubt  # atan 7/40
     with pytest.raises(InputError, match=r"5\.0 mm from the entry of the case: .*free_radius_mm \(4\.9 mm\)"):
         place(case, PeerGeometry("peer", None, tuple(target), tuple(entry)), 14.9)
 
@@ -193,7 +193,7 @@ def test_an_entry_is_judged_when_it_arrives_and_counts_for_the_targets_after_it(
 def test_layers_are_said_not_to_be_fitted_again_only_with_a_case(case):
     aimed = PeerGeometry("peer", None, tuple(to_ras((44.0, 2.0, 1.0))))
     assert [
-        "not fitted again" in " ".join(place(case, aimed, radius).lines) for radius in (np.inf, 15.0)
+        "fitted around the axis" in " ".join(place(case, aimed, radius).lines) for radius in (np.inf, 15.0)
     ] == [
         False,
         True,

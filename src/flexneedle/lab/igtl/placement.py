@@ -43,7 +43,7 @@ class Placer:
         self._last: PeerGeometry | None = None  # an entry alone
 
     def forget_entry(self) -> None:
-        """Let later targets be without the entry that came before."""
+        """Forget the entry, so that later targets do not use it."""
         self._last = None
 
     def place(self, scenario: Scenario, received: PeerGeometry) -> Placement:
@@ -117,7 +117,7 @@ def _describe_registration(own: ImageRegistration | None, received: ImageRegistr
             f"registration of the image: differs from [image] of the scenario by up to {off:.2g} mm: {rule}; "
             "[image] is kept"
         )
-    return "registration of the image: [image] of the scenario"
+    return "registration of the image: the same as [image] of the scenario"
 
 
 def _describe_image(scenario: Scenario) -> Iterator[str]:
@@ -161,8 +161,8 @@ def _doubts(entry: Point, target: Point, *, fitted: bool) -> Iterator[str]:
     if fitted:
         angle = math.degrees(math.atan2(math.dist(off, way), at))
         yield (
-            f"outside of the model's assumptions: skin and layers are of the axis, {math.hypot(*off):.1f} mm "
-            f"from the entry, at an angle of {angle:.1f} degrees to the line from entry to target; not fitted again"
+            "outside of the model's assumptions: skin and layers were fitted around the axis of the case, "
+            f"{math.hypot(*off):.1f} mm from this entry, at {angle:.1f} degrees to the line from it to the target"
         )
 
 
