@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from flexneedle.types import Control, Frame, Measurement, Motion
+from flexneedle.types import Control, Frame, Measurement, Motion, Reading
 
 
 class Clock(Protocol):
@@ -65,6 +65,19 @@ class TipTracker(Protocol):
     """Measures the tip of the needle in the frame of the stage."""
 
     def read(self) -> tuple[Measurement, ...]:
+        """Return the readings since the last call, oldest first, without waiting; may be empty."""
+        ...
+
+    @property
+    def status(self) -> str:
+        """VISIBLE while readings arrive, otherwise the reason in a few words."""
+        ...
+
+
+class NeedleSensor(Protocol):
+    """Measures the needle: a sensor of the scenario's `[[sensor]]`, other than the tracker."""
+
+    def read(self) -> tuple[Reading, ...]:
         """Return the readings since the last call, oldest first, without waiting; may be empty."""
         ...
 

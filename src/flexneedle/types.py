@@ -317,6 +317,56 @@ class Measurement:
                 object.__setattr__(self, name, check_covariance(name, matrix, size))
 
 
+@dataclass(frozen=True, eq=False)
+class Needles:
+    """Shapes of a needle at m instants, at n nodes equally spaced along it, base to tip.
+
+    points (m, n, 3): x, y, z (mm); tilts (m, n, 2): angle of its axis from x (rad), in the directions y and z; roll
+    (m,): angle of the needle about its axis (rad); spacing: distance of two nodes along the needle (mm).
+    """
+
+    points: Floats
+    tilts: Floats
+    roll: Floats
+    spacing: float
+
+    @staticmethod
+    def of(poses: Floats, roll: Floats, length: float) -> "Needles":
+        """Return the needles of poses (m, n, 5), whose slopes are dy/dx and dz/dx; length: of the needle (mm)."""
+        size = np.hypot(poses[..., THETA], poses[..., PSI])
+        share = np.divide(np.arctan(size), size, out=np.ones_like(size), where=size > 0.0)
+        tilts = share[..., None] * poses[..., THETA:]
+        return Needles(poses[..., : Z + 1], tilts, roll, length / (poses.shape[1] - 1))
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A reading of a sensor along the needle, other than the tracker's.
+
+    Attributes:
+        time: Time of measurement (s, on the clock of the run).
+        rows: What it measured, rows of numbers as its kind defines them, NaN for a missing number; no rows if it
+            measured nothing. `fbg`: κy, κz (1/mm) of each site in the frame that rolls with the needle, the site next
+            to the tip first. `slice`: x, y, z (mm) of the crossing. `points`: x, y, z of each point. `view`: column and
+            row (pixels) of each point.
+        status: VISIBLE, or why there is no valid value.
+
+    Raises:
+        InputError: rows are not rows of numbers of one length.
+    """
+
+    time: float
+    rows: Matrix
+    status: str = VISIBLE
+
+    def __post_init__(self) -> None:
+        given = list(self.rows)
+        rows = read_rows(given, len(given[0]) if given else 0)
+        if rows is None:
+            raise make_refusal("rows", self.rows, "must be rows of numbers, all as long")
+        object.__setattr__(self, "rows", rows)
+
+
 class VerdictKind(StrEnum):
     """Result of a check of a measurement, or of the field in which it was taken."""
 

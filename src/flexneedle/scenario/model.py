@@ -29,10 +29,12 @@ from flexneedle.scenario.sections.needle import Needle
 from flexneedle.scenario.sections.settings import ControlSettings, PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.structure import structure_problems
 from flexneedle.scenario.sections.zones import AnyZone, ImageSettings, ZoneSettings
+from flexneedle.scenario.sensors.kinds import AnySensor
 from flexneedle.scenario.tissue.laws import AnyLayer
 from flexneedle.scenario.tissue.layer import Contact
 
 _ENVIRONMENT = "tracker.environment"
+_LISTS = ("zone", "sensor")  # absent in files that list none
 
 
 class Difference(NamedTuple):
@@ -65,6 +67,8 @@ class Scenario(Section):
     plan: PlanSettings = PlanSettings()
     control: ControlSettings = ControlSettings()
     tracker: TrackerSettings = TrackerSettings()
+    sensor: Annotated[tuple[AnySensor, ...], Field(strict=False, max_length=100)] = ()
+    """Sensors along the needle, besides the tracker."""
     monitor: MonitorSettings = MonitorSettings()
     guard: GuardSettings = GuardSettings()
     phantom: PhantomSettings = PhantomSettings()
@@ -112,7 +116,7 @@ class Scenario(Section):
     def values(self) -> dict[str, Any]:
         """Return nested tables, with all defaults, without the keys that are not set."""
         values = self.model_dump(mode="json", exclude_none=True)
-        return values if self.zone else {name: value for name, value in values.items() if name != "zone"}
+        return {name: value for name, value in values.items() if value or name not in _LISTS}
 
     def with_values(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with values replaced by dotted key (`tissue.0.alpha`); None removes a key.

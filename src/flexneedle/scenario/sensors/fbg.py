@@ -1,0 +1,117 @@
+"""Fibre Bragg gratings along the needle: curvature at sites, in the frame that rolls with the needle."""
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from flexneedle.scenario.sections.fields import NonNegative, Positive
+from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors, perturbed, rotate
+from flexneedle.types import Needles
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_PER_M = 1e-3
+_MODEL_PER_M = 0.02
+_MODEL_SHARE = 0.03  # of the curvature along the plan
+
+
+class FbgErrors(SensorErrors):
+    """Table `phantom` of a sensor `fbg`."""
+
+    site_mm: NonNegative = 1.0
+    """Largest displacement of each site along the needle."""
+    temperature_per_m: NonNegative = 0.02
+    """Error of all curvatures from the start to the end of an insertion, by what is left of the temperature."""
+
+
+class Fbg(Sensor):
+    """One `[[sensor]]` with `kind = "fbg"`."""
+
+    kind: Literal["fbg"]
+    sites_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=1000)]
+    """Distances of the sites from the tip, along the needle."""
+    gauge_mm: Positive = 5.0
+    """Length over which a site measures the mean curvature."""
+    rate_hz: Positive = 100.0
+    """Readings per second."""
+    delay_s: NonNegative = 0.02
+    """Age of a reading on arrival."""
+    noise_per_m: Positive = 0.05
+    """Standard deviation of the white noise of a curvature."""
+    bias_per_m: NonNegative = 0.1
+    """Prior standard deviation of the constant error of a curvature."""
+    gain_sd: Annotated[float, Field(ge=0, le=1)] = 0.03
+    """Prior standard deviation of the gain error, relative."""
+    turn_sd_deg: Annotated[float, Field(ge=0, le=90)] = 2.0
+    """Prior standard deviation of the angle between the sensor's axes and the bevel's, in space."""
+    wander_per_m: NonNegative = 0.0
+    """Standard deviation of noise that is correlated over `wander_s`."""
+    phantom: FbgErrors = FbgErrors()
+
+    @field_validator("sites_mm")
+    @classmethod
+    def _rise(cls, sites: tuple[float, ...]) -> tuple[float, ...]:
+        if any(later <= earlier for earlier, later in zip(sites, sites[1:], strict=False)):
+            raise ValueError("must rise, from the tip on")
+        return sites
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the white noise, 1/mm."""
+        return _PER_M * self.noise_per_m
+
+    @property
+    def offset_sd(self) -> float:
+        """Prior standard deviation of the constant error, 1/mm."""
+        return _PER_M * self.bias_per_m
+
+    @property
+    def wander_sd(self) -> float:
+        """Standard deviation of the correlated noise, 1/mm."""
+        return _PER_M * self.wander_per_m
+
+    def size(self, axes: int) -> int:
+        """Return the number of curvatures."""
+        return axes * len(self.sites_mm)
+
+    def predict(self, needles: Needles, axes: int) -> "Floats":
+        """Return the mean curvatures (m, d), 1/mm, over the gauges, in the frame that rolls with the needle."""
+        half = 0.5 * self.gauge_mm
+        ends = [tilts_at(needles, np.maximum(0.0, np.array(self.sites_mm) + off)) for off in (half, -half)]
+        length = np.array(self.sites_mm) + half - np.maximum(0.0, np.array(self.sites_mm) - half)
+        bent = (ends[1] - ends[0])[..., :axes] / length[:, None]
+        return rotate(bent.reshape(len(bent), -1), -needles.roll, axes)
+
+    def model_error(self, planned: "Floats") -> "Floats":
+        """Return standard deviations (d,), 1/mm: a constant, and a share of the curvature along the plan."""
+        return np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * np.sqrt(np.mean(planned**2, axis=0)))
+
+    def mounted(self, rng: np.random.Generator) -> Self:
+        """Return the sensor with its sites displaced."""
+        most = min(self.phantom.site_mm, 0.4 * min(np.diff(self.sites_mm, prepend=0.0)))
+        return self.model_copy(update={"sites_mm": tuple(perturbed(self.sites_mm, most, rng))})
+
+    def drifts(self, rng: np.random.Generator, axes: int) -> "Floats":
+        """Return the error (d,), 1/mm, at the end of an insertion by the temperature."""
+        drift: Any = rng.normal(0.0, _PER_M * self.phantom.temperature_per_m, axes)
+        return np.tile(drift, len(self.sites_mm))
+
+
+def tilts_at(needles: Needles, distances: "Floats") -> "Floats":
+    """Return tilts (m, k, 2) at distances (k,), mm, from the tip: the slope of the cubic between two nodes."""
+    points, tilts = needles.points, needles.tilts
+    last = points.shape[1] - 1
+    place = np.clip(last - distances / needles.spacing, 0.0, last - 1e-9)
+    left = place.astype(int)
+    r = (place - left)[:, None]
+    before, after = tilts[:, left], tilts[:, left + 1]
+    step = points[:, left + 1] - points[:, left]
+    chord = np.hypot(step[..., 1], step[..., 2])
+    tilt = np.arctan2(chord, step[..., 0]) / np.where(chord > 0.0, chord, 1.0)
+    mean = tilt[..., None] * step[..., 1:]
+    # The quadratic with these ends and this mean.
+    return before * (1.0 - r) + after * r + 6.0 * r * (1.0 - r) * (mean - 0.5 * (before + after))

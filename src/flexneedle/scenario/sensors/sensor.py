@@ -1,0 +1,167 @@
+"""A sensor along the needle: the common part of all kinds.
+
+A kind says what an error-free sensor measures on a needle, and how large the errors are. A reading is
+
+    (1 + g) e^(iρ) q + o + w + ε
+
+with the quantity q of the needle, gain error g, turn ρ, offset o, wander w (correlated over time) and white noise ε.
+Units of values are those that the kind chooses, the same in all of its methods.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from flexneedle.scenario.sections.fields import LARGEST, Fraction, NonNegative, Positive, Section, Title
+from flexneedle.types import Matrix, Needles, Reading
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
+FAULTS = ("none", "lost", "frozen", "drift", "outliers", "delayed")
+
+
+class SensorErrors(Section):
+    """Table `phantom` of a `[[sensor]]`: errors of the virtual sensor that the observer does not know.
+
+    They are drawn for each insertion, uniformly where a largest value is given.
+    """
+
+    clock_s: NonNegative = 0.0
+    """Largest error of the time stamps, to either side."""
+    missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    """Share of readings without a value."""
+    outlier_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of readings whose error is `outlier_size` times the noise."""
+    outlier_size: NonNegative = 20.0
+    """Error of an outlier, over the noise."""
+    fault: Literal["none", "lost", "frozen", "drift", "outliers", "delayed"] = "none"
+    """Fault that begins at `fault_depth_mm` and lasts."""
+    fault_depth_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] = 0.0
+    """Depth of the tip at which the fault begins."""
+    fault_size: NonNegative = 1.0
+    """Size of the fault: growth of the error per mm of depth, over the noise (`drift`); share of readings (`outliers`);
+    time in s (`delayed`)."""
+
+
+class Sensor(Section):
+    """One `[[sensor]]`. A kind is a subclass with its keys, `noise`, `size` and `predict`.
+
+    A value of a sensor is an array (d,). Where a needle in space has two lateral components, they follow each other.
+    """
+
+    kind: str
+    """`fbg`, `slice`, `points`, `view` or `module:NAME`."""
+    name: Title | None = None
+    """Name in messages, tables and figures. Not set: the kind."""
+    rate_hz: Positive = 20.0
+    """Readings per second."""
+    delay_s: NonNegative = 0.0
+    """Age of a reading on arrival, for sensors that do not report the time of measurement."""
+    delay_sd_s: NonNegative = 0.0
+    """Prior standard deviation of the error of time stamps. 0: they are exact."""
+    gain_sd: Fraction = 0.0
+    """Prior standard deviation of the gain error, relative."""
+    turn_sd_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+    """Prior standard deviation of the turn of the sensor's lateral axes about the needle; in space."""
+    wander_s: Positive = 10.0
+    """Time over which the wander is correlated."""
+    phantom: SensorErrors = SensorErrors()
+
+    @property
+    def title(self) -> str:
+        """Name in messages."""
+        return self.name or self.kind
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the white noise of a value."""
+        raise NotImplementedError
+
+    @property
+    def offset_sd(self) -> float:
+        """Prior standard deviation of the constant error of a value."""
+        return 0.0
+
+    @property
+    def wander_sd(self) -> float:
+        """Standard deviation of the correlated noise of a value."""
+        return 0.0
+
+    @property
+    def resolution(self) -> float:
+        """Step of the values; 0: repeated values are the sign of a frozen sensor."""
+        return 0.0
+
+    @property
+    def paired(self) -> bool:
+        """True if values in space are pairs of lateral components, y and z."""
+        return True
+
+    def size(self, axes: int) -> int:
+        """Return the number of values d of a needle with 1 or 2 lateral axes."""
+        raise NotImplementedError
+
+    def predict(self, needles: Needles, axes: int) -> "Floats":
+        """Return the values (m, d) of an error-free sensor on needles; finite, beyond the tip, too."""
+        raise NotImplementedError
+
+    def sees(self, needles: Needles, axes: int) -> "Flags":
+        """Return which values (m, d) the sensor can measure on needles (default: all)."""
+        return np.ones((len(needles.points), self.size(axes)), dtype=bool)
+
+    def model_error(self, planned: "Floats") -> "Floats":
+        """Return standard deviations (d,) of the model's error in the mean of a move; planned (m, d): along a plan."""
+        raise NotImplementedError
+
+    def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
+        """Return the values (d,) of a reading, NaN where it has none; needle: as predicted at its time (m = 1).
+
+        Raises ValueError, with the rule, for rows of another shape.
+        """
+        return flatten(reading.rows, self.size(axes), axes)
+
+    def report(self, values: "Floats", axes: int) -> Matrix:
+        """Return the rows of a reading with these values (d,): the inverse of `read`, for virtual sensors."""
+        return tuple(tuple(row) for row in np.reshape(values, (-1, axes if self.paired else 1)).tolist())
+
+    def mounted(self, rng: np.random.Generator) -> Self:  # noqa: ARG002  for kinds with a place
+        """Return the sensor where it really is, drawn from `phantom`."""
+        return self
+
+    def drawn_offset(self, rng: np.random.Generator, axes: int) -> "Floats":
+        """Return the offset (d,) of the virtual sensor."""
+        return rng.normal(0.0, self.offset_sd, self.size(axes))
+
+
+def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
+    """Return the values (size,) of rows, of which the first `axes` numbers count; NaN without rows."""
+    if not rows:
+        return np.full(size, np.nan)
+    values: Floats = np.array(rows)[:, :axes].ravel()
+    if values.size != size:
+        raise ValueError(f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}")
+    return values
+
+
+def rotate(values: "Floats", angle: Any, axes: int) -> "Floats":
+    """Return pairs (m, d) turned by angles (m,) or (); in the plane the cosine counts."""
+    if axes == 1:
+        return values * np.cos(angle)[..., None]
+    pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.exp(1j * np.asarray(angle))[..., None]
+    return interleave(pairs)
+
+
+def interleave(pairs: "NDArray[Any]") -> "Floats":
+    """Return the components (m, 2 n) of lateral quantities y + iz (m, n)."""
+    return np.stack([pairs.real, pairs.imag], axis=-1).reshape(len(pairs), -1)
+
+
+def perturbed(values: Sequence[float], most: float, rng: np.random.Generator) -> list[float]:
+    """Return values, each displaced by up to ±most."""
+    return (np.asarray(values) + rng.uniform(-most, most, len(values))).tolist()

@@ -1,0 +1,127 @@
+"""An image plane that the needle crosses, such as a slice of ultrasound, CT or MRI."""
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from flexneedle.scenario.sections.environment import Direction
+from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive
+from flexneedle.scenario.sensors.crossing import cross, passed
+from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors
+from flexneedle.types import Matrix, Needles, Reading
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
+_MODEL_MM = 0.03
+
+
+class PlaneErrors(SensorErrors):
+    """Table `phantom` of a sensor `slice`."""
+
+    place_mm: NonNegative = 0.3
+    """Largest displacement of the image, on each axis."""
+    tilt_deg: NonNegative = 1.0
+    """Largest rotation of the image, about each axis."""
+
+
+class Slice(Sensor):
+    """One `[[sensor]]` with `kind = "slice"`."""
+
+    kind: Literal["slice"]
+    plane_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+    """x at which the plane meets the insertion axis."""
+    normal: Direction = (1.0, 0.0, 0.0)
+    """Normal x, y, z of the plane, of any length, at most 80° from x."""
+    rate_hz: Positive = 10.0
+    """Images per second."""
+    delay_s: NonNegative = 0.1
+    """Age of an image on arrival."""
+    noise_mm: Positive = 0.5
+    """Standard deviation of the white noise of a coordinate in the plane."""
+    pose_sd_mm: NonNegative = 0.3
+    """Prior standard deviation of the constant error of a coordinate: of the plane's pose."""
+    wander_mm: NonNegative = 0.0
+    """Standard deviation of noise that is correlated over `wander_s`."""
+    phantom: PlaneErrors = PlaneErrors()
+    _shift: Any = PrivateAttr((0.0, 0.0, 0.0))  # of the true image (mm)
+    _turn: Any = PrivateAttr((0.0, 0.0, 0.0))  # its rotation vector (rad)
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the white noise, mm."""
+        return self.noise_mm
+
+    @property
+    def offset_sd(self) -> float:
+        """Prior standard deviation of the constant error, mm."""
+        return self.pose_sd_mm
+
+    @property
+    def wander_sd(self) -> float:
+        """Standard deviation of the correlated noise, mm."""
+        return self.wander_mm
+
+    def size(self, axes: int) -> int:
+        """Return the number of coordinates in the plane."""
+        return axes
+
+    @property
+    def frame(self) -> "Floats":
+        """Rows (3, 3): normal, and the directions in the plane nearest to y and to z."""
+        normal = np.array(self.normal) / np.linalg.norm(self.normal)
+        normal *= math.copysign(1.0, normal[0])
+        across = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
+        across /= np.linalg.norm(across)
+        return np.array([normal, across, np.cross(normal, across)])
+
+    def _in_frame(self, points: "Floats") -> tuple["Floats", "Floats"]:
+        """Return the distance (…) of points (…, 3) from the plane, and their coordinates (…, 2) in it."""
+        frame = self.frame + np.cross(self._turn, self.frame)  # of a small rotation
+        places = (points - [self.plane_mm, 0.0, 0.0] - self._shift) @ frame.T
+        return places[..., 0], places[..., 1:]
+
+    def predict(self, needles: Needles, axes: int) -> "Floats":
+        """Return the coordinates (m, axes), mm, of the crossing in the plane."""
+        along, across = self._in_frame(needles.points)
+        return cross(along, across[..., :axes], np.zeros(1))[:, 0]
+
+    def sees(self, needles: Needles, axes: int) -> "Flags":
+        """Return whether needles have passed the plane (m, axes)."""
+        return passed(self._in_frame(needles.points)[0], np.zeros(1), axes)
+
+    def model_error(self, planned: "Floats") -> "Floats":
+        """Return standard deviations (axes,), mm."""
+        return np.full(planned.shape[1], _MODEL_MM)
+
+    def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
+        """Return the coordinates in the plane of x, y, z (mm)."""
+        del needle
+        if not reading.rows:
+            return np.full(axes, np.nan)
+        if np.shape(reading.rows) != (1, 3):
+            raise ValueError(f"{len(reading.rows)} rows of {len(reading.rows[0])} numbers, expected one x, y, z")
+        return self._in_frame(np.array(reading.rows[0]))[1][:axes]
+
+    def report(self, values: "Floats", axes: int) -> Matrix:
+        """Return x, y, z (mm) of coordinates in the plane."""
+        inside = np.append(values, 0.0)[:2] if axes == 1 else values
+        x, y, z = ([self.plane_mm, 0.0, 0.0] + inside @ self.frame[1:]).tolist()
+        return ((x, y, z),)
+
+    def mounted(self, rng: np.random.Generator) -> Self:
+        """Return the sensor with its image displaced and rotated; its values are in the image's own axes."""
+        image = self.model_copy()
+        image._shift = rng.uniform(-1.0, 1.0, 3) * self.phantom.place_mm
+        image._turn = np.radians(rng.uniform(-1.0, 1.0, 3) * self.phantom.tilt_deg)
+        return image
+
+    def drawn_offset(self, rng: np.random.Generator, axes: int) -> "Floats":
+        """Return 0: its pose has the error."""
+        del rng
+        return np.zeros(axes)
