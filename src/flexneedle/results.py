@@ -26,9 +26,11 @@ from flexneedle.types import (
     Control,
     Floats,
     Lateral,
+    Matrix,
     Measurement,
     Point,
     Pose,
+    SensorState,
     Shape,
     Verdict,
     X,
@@ -247,6 +249,9 @@ class Period:
     energy_scale: float = math.nan  # E₁ (mJ): see `Scenario.energy_scale`
     clearance: float = math.inf  # of the estimated needle from zones (mm), a bound; infinite without zones
     true_clearance: float | None = None  # of the needle with its true shape, if it is known
+    sensors: tuple[SensorState, ...] = ()  # along the needle
+    # of the estimated tip (mm²), None for an observer that gives none, and without sensors along the needle
+    tip_covariance: Matrix | None = None
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"

@@ -419,6 +419,25 @@ class CheckedReading:
     verdict: Verdict
 
 
+@dataclass(frozen=True)
+class SensorState:
+    """A sensor after a period, for the record.
+
+    readings: of this period, with their verdicts; verdict: on the sensor: OK while it corrects the model; nis: normalised
+    square of the innovation, 1 on average, NaN without a good reading.
+    """
+
+    name: str
+    readings: tuple[CheckedReading, ...] = ()
+    verdict: Verdict = OK
+    nis: float = math.nan
+
+    @property
+    def good(self) -> tuple[Reading, ...]:
+        """The readings that correct the model."""
+        return tuple(one.reading for one in self.readings if one.verdict.ok) if self.verdict.ok else ()
+
+
 class Law(Protocol):
     """Radial compression of a tissue, scaled to the stiffness 1 at e = 0; functions of arrays of e in [0, limit]."""
 

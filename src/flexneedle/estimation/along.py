@@ -21,10 +21,16 @@ _ROUNDING_S = 1e-9
 
 
 class SensorSlots(NamedTuple):
-    """Places of a sensor's parameters: offset (d), and gain error, turn (rad) and clock error (s) where they exist."""
+    """Places of a sensor's parameters: offset (d), and where they exist gain errors, turn (rad) and clock error (s).
+
+    drift: steps, one after another, of an error of all values that grows along the way; place: places of the sensor; gain:
+    of each pair of values.
+    """
 
     offset: slice
-    gain: int | None
+    drift: slice
+    place: slice
+    gain: slice
     turn: int | None
     clock: int | None
 
@@ -105,6 +111,7 @@ class SensorFit:
     slots: SensorSlots
     axes: int
     model_sd: Floats  # model error (d,) of the mean of a move
+    depths: Floats  # of the tip at the knots of the drift (k,), mm, behind the skin
     time: Floats  # (r,), s
     value: Floats  # (r, d), NaN where nothing was measured
     used: Flags  # readings (r,) that correct the model
@@ -128,7 +135,7 @@ class SensorFit:
         return replace(self, used=self.used & (self.time < since))
 
     def parameter(self, parameters: Floats, name: str) -> float:
-        """Return gain error, turn or clock error of parameters (K,); 0 where it is not estimated."""
+        """Return turn or clock error of parameters (K,); 0 where it is not estimated."""
         place = getattr(self.slots, name)
         return 0.0 if place is None else float(parameters[place])
 
@@ -157,16 +164,31 @@ class SensorFit:
         return Bins(index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number)
 
     def quantities(self, poses: Floats, length: float) -> Floats:
-        """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm)."""
-        flat = poses.reshape(-1, *poses.shape[-2:])
-        found = self.sensor.predict(Needles(flat, length / (flat.shape[1] - 1)), self.axes)
-        return found.reshape(*poses.shape[:-2], -1)
+        """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm).
 
-    def predict_at(self, time: Floats, ends: Floats, line: Timeline, parameters: Floats) -> Floats:
-        """Return the predicted values (r, d) at times (r,), from quantities (m + 1, d) at the ends of the moves."""
+        Their derivatives to its places follow: (…, d, 1 + p).
+        """
+        flat = poses.reshape(-1, *poses.shape[-2:])
+        needles = Needles(flat, length / (flat.shape[1] - 1))
+        found = self.sensor.predict(needles, self.axes)[:, :, None]
+        if self.sensor.place_sds:
+            found = np.concatenate([found, self.sensor.slopes(needles, self.axes)], axis=2)
+        return found.reshape(*poses.shape[:-2], *found.shape[1:])
+
+    def placed(self, ends: Floats, parameters: Floats) -> Floats:
+        """Return the values (m, d) of the sensor at its estimated places, of `quantities` (m, d, 1 + p)."""
+        level = ends[:, :, 0]
+        return level + ends[:, :, 1:] @ parameters[self.slots.place] if ends.shape[2] > 1 else level
+
+    def predict_at(self, time: Floats, ends: Floats, depth: float, line: Timeline, parameters: Floats) -> Floats:
+        """Return the predicted values (r, d) at times (r,), from `quantities` (m + 1, d, 1 + p) at the ends of the moves.
+
+        depth: of the tip (mm).
+        """
         index, part, angle = line.at(time - self.parameter(parameters, "clock"))
+        ends = self.placed(ends, parameters)
         level = (1.0 - part)[:, None] * ends[index] + part[:, None] * ends[index + 1]
-        return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + parameters[self.slots.offset]
+        return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + self._errors(np.array([depth]), parameters)
 
     def bin_at(self, time: Floats, line: Timeline) -> Bins:
         """Return bins (b,) of one reading each, at times (b,)."""
@@ -175,40 +197,72 @@ class SensorFit:
         facing = np.exp(1j * angle) if self.sensor.rolls else np.ones(len(time), dtype=complex)
         return Bins(index, part, none, none, facing, time)
 
+    def _spread(self, depth: Floats) -> Floats:
+        """Return the drift (b, d, k · c) of values by the components of its steps, with the tip at depths (b,), mm.
+
+        It is 0 up to the skin, and changes by a step from knot to knot, linearly: a random walk.
+        """
+        size = len(self.model_sd)
+        width = self.axes if self.sensor.paired else 1
+        begins = np.append(0.0, self.depths[:-1])
+        ramps = np.clip((depth[:, None] - begins) / (self.depths - begins), 0.0, 1.0)
+        units = np.tile(np.eye(width), (size // width, 1))
+        spread: Floats = np.einsum("bk,dc->bdkc", ramps, units).reshape(len(depth), size, -1)
+        return spread
+
     def variances(self, bins: Bins) -> Floats:
         """Return the variances (b, d) of means, infinite where nothing was measured."""
         noise = self.sensor.noise**2 / np.maximum(bins.count, 1.0) + self.model_sd**2
         return np.where(bins.count > 0.0, noise, np.inf)
 
-    def expected(self, bins: Bins, ends: Floats, parameters: Floats) -> Floats:
-        """Return the predicted means (b, d), of quantities (m + 1, d) at the ends of the moves."""
-        level = self._with_gain(between(bins, ends), parameters)
-        return level + self._turned(np.broadcast_to(parameters[self.slots.offset], level.shape), bins.facing)
+    def expected(self, bins: Bins, ends: Floats, depth: Floats, parameters: Floats) -> Floats:
+        """Return the predicted means (b, d), of `quantities` at the ends of the moves, with the tip at depths (b,), mm."""
+        level = self._with_gain(between(bins, self.placed(ends, parameters)), parameters)
+        return level + self._turned(self._errors(depth, parameters), bins.facing)
+
+    def _errors(self, depth: Floats, parameters: Floats) -> Floats:
+        """Return offset and drift (b, d), with the tip at depths (b,), mm."""
+        offset = np.broadcast_to(parameters[self.slots.offset], (len(depth), len(self.model_sd)))
+        if self.slots.drift.stop == self.slots.drift.start:
+            return offset
+        return offset + self._spread(depth) @ parameters[self.slots.drift]
 
     def _turned(self, value: Floats, facing: Any) -> Floats:
         """Return values (r, d) of a sensor that rolls in the stage's axes, others as they are."""
         return turn(value, facing, self.axes) if self.sensor.rolls else value
 
+    def _gains(self, parameters: Floats) -> Floats:
+        """Return the gains (d,), or (1,) where their error is not estimated."""
+        errors = parameters[self.slots.gain]
+        return 1.0 + (np.repeat(errors, len(self.model_sd) // errors.size) if errors.size else np.zeros(1))
+
     def _with_gain(self, level: Floats, parameters: Floats) -> Floats:
-        scaled = (1.0 + self.parameter(parameters, "gain")) * level
+        scaled = self._gains(parameters) * level
         if self.slots.turn is None:
             return scaled
         return turn(scaled, np.exp(1j * parameters[self.slots.turn]), self.axes)
 
     def jacobian(
-        self, bins: Bins, ends: Floats, slopes: Floats, parameters: Floats, line: Timeline
+        self, bins: Bins, ends: Floats, depth: Floats, slopes: Floats, parameters: Floats, line: Timeline
     ) -> Floats:
-        """Return derivatives (b, d, K) of the predicted means, from those (b, K, d) of the quantities."""
+        """Return derivatives (b, d, K) of the predicted means, from those (b, K, d) of the quantities.
+
+        Other arguments: as for `expected`.
+        """
+        slopes_of_places, ends = ends[:, :, 1:], self.placed(ends, parameters)
         level = between(bins, ends)
-        jacobian = (1.0 + self.parameter(parameters, "gain")) * slopes.transpose(0, 2, 1)
-        size = level.shape[1]
-        offset = np.zeros((len(level), size, size))
-        units = np.eye(size)
-        for k in range(size):
-            offset[:, :, k] = self._turned(np.broadcast_to(units[k], level.shape), bins.facing)
-        jacobian[:, :, self.slots.offset] = offset
-        if self.slots.gain is not None:
-            jacobian[:, :, self.slots.gain] = level
+        jacobian = self._gains(parameters)[:, None] * slopes.transpose(0, 2, 1)
+        for k in range(level.shape[1]):
+            unit = np.broadcast_to(np.eye(level.shape[1])[k], level.shape)
+            jacobian[:, :, self.slots.offset.start + k] = self._turned(unit, bins.facing)
+        if self.slots.drift.stop > self.slots.drift.start:
+            spread = self._spread(depth)
+            for k in range(spread.shape[2]):
+                jacobian[:, :, self.slots.drift.start + k] = self._turned(spread[:, :, k], bins.facing)
+        for k in range(slopes_of_places.shape[2]):
+            jacobian[:, :, self.slots.place.start + k] = between(bins, slopes_of_places[:, :, k])
+        if count := self.slots.gain.stop - self.slots.gain.start:
+            jacobian[:, :, self.slots.gain] = level[:, :, None] * np.repeat(np.eye(count), level.shape[1] // count, axis=0)
         if self.slots.turn is not None:
             jacobian[:, :, self.slots.turn] = turn(level, np.array(1j), self.axes)
         if self.slots.clock is not None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.estimation.along import Bins, SensorFit, between, whiten
+from flexneedle.estimation.along import Bins, SensorFit, whiten
 from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, Simulated, adapt_models
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
@@ -140,8 +140,9 @@ def inform_along(fitted: FittedInsertion) -> tuple[Floats, Floats]:
     precision = np.zeros((gradient.size, gradient.size))
     for k, one in enumerate(fitted.along):
         bins, ends = fitted.bins[k], fitted.quantities[k]
-        slopes = fitted.along_slopes(between(bins, fitted.tips[:, X, None])[:, 0], k)
-        jacobian = one.jacobian(bins, ends, slopes, fitted.parameters, fitted.timeline)
+        depth = fitted.depths(bins)
+        slopes = fitted.along_slopes(depth, k)
+        jacobian = one.jacobian(bins, ends, depth, slopes, fitted.parameters, fitted.timeline)
         for left, rows in _whitened(one, bins, fitted.along_residuals[k], jacobian):
             gradient += rows.T @ left
             precision += rows.T @ rows
@@ -209,7 +210,7 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
     if fitted.along and needles.begun:
         whole = fitted.quantities_of(np.concatenate([shapes, further.shapes], axis=1))
         along_curves = tuple(
-            _renew(old, needles.begun, (each[1:] - each[0]) / fitted.prior.steps[needles.begun, None, None], depth, fitted.grid)
+            _renew(old, needles.begun, (each[1:, ..., 0] - each[0, ..., 0]) / fitted.prior.steps[needles.begun, None, None], depth, fitted.grid)
             for old, each in zip(along_curves, whole, strict=True)
         )
     reached = zip(needles.begun, models[1:], states[1:], strict=True)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.estimation.along import Bins, SensorFit, Timeline
+from flexneedle.estimation.along import Bins, SensorFit, Timeline, between
 from flexneedle.estimation.axial import scale_advance
 from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.move_means import MoveMeans
@@ -68,7 +68,7 @@ class FittedInsertion:
     moves: tuple[Move, ...] = ()
     slots: Slots = field(kw_only=True)  # places of the parameters
     along: tuple[SensorFit, ...] = ()  # sensors along the needle
-    quantities: tuple[Floats, ...] = ()  # their values (m + 1, d) at the ends of the moves
+    quantities: tuple[Floats, ...] = ()  # their values (m + 1, d, 1 + p) at the ends of the moves
     along_curves: tuple[Floats, ...] = ()  # derivatives (K, g, d) of their values over the depths
     field_sd: float = 0.0  # of the tracker's error that is correlated along the path (mm)
 
@@ -150,7 +150,14 @@ class FittedInsertion:
     def along_residuals(self) -> list[Floats]:
         """Residuals (b, d) of the sensors along the needle: means minus the model's values."""
         parts = zip(self.along, self.bins, self.quantities, strict=True)
-        return [bins.value - one.expected(bins, ends, self.parameters) for one, bins, ends in parts]
+        return [
+            bins.value - one.expected(bins, ends, self.depths(bins), self.parameters)
+            for one, bins, ends in parts
+        ]
+
+    def depths(self, bins: Bins) -> Floats:
+        """Return the depths (b,), mm, of the tip at means of readings."""
+        return between(bins, self.tips[:, X, None])[:, 0]
 
     def along_slopes(self, depth: Floats, sensor: int) -> Floats:
         """Return derivatives (b, K, d) of the quantities of a sensor along the needle at depths (b,), mm."""
@@ -219,7 +226,7 @@ class FittedInsertion:
         )
 
     def quantities_of(self, shapes: Floats) -> tuple[Floats, ...]:
-        """Return the values (…, d) of each sensor along the needle on shapes (…, n, 5)."""
+        """Return the values (…, d, 1 + p) of each sensor along the needle on shapes (…, n, 5)."""
         length = self.nominal.scenario.needle.length_mm
         return tuple(one.quantities(shapes, length) for one in self.along)
 

@@ -22,7 +22,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from flexneedle.estimation.along import Comparison, SensorFit, SensorSlots, between
+from flexneedle.estimation.along import Comparison, SensorFit, SensorSlots
 from flexneedle.estimation.axial import (
     AS_COMMANDED,
     EvenAdvance,
@@ -47,6 +47,7 @@ from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurem
 
 _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
+_KNOTS = 3  # of a drift, down to the target
 _RECENT = 12  # moves whose residuals are low-passed
 
 
@@ -277,10 +278,11 @@ class Identified(FittedInsertion):
         k = next(k for k, one in enumerate(self.along) if one.name == name)
         one, values = self.along[k], self._values(self.along[k], readings)
         time, ends = np.array([each.time for each in readings]), self.quantities[k]
-        predicted = one.predict_at(time, ends, self.timeline, self.parameters)
+        predicted = one.predict_at(time, ends, float(self.state.tip[X]), self.timeline, self.parameters)
         bins = one.bin_at(time[-1:], self.timeline)
-        slopes = self.along_slopes(between(bins, self.tips[:, X, None])[:, 0], k)
-        jacobian = one.jacobian(bins, ends, slopes, self.parameters, self.timeline)[0]
+        depth = self.depths(bins)
+        slopes = self.along_slopes(depth, k)
+        jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)[0]
         known = jacobian @ self.covariance @ jacobian.T + np.diag(one.model_sd**2) + one.sensor.wander_sd**2 * np.eye(len(jacobian))
         return Comparison(values, values - predicted, known, one.sensor.noise)
 
@@ -390,18 +392,23 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
     shapes = planned_shapes(task, state) if scenario.sensor else np.zeros((0, 2, 5))
     for sensor in scenario.sensor:
         size, paired = sensor.size(axes), sensor.paired and axes == 2
-        offset = add([sensor.offset_sd] * size)
-        gain, turned, clock = (
+        offset, grows = add([sensor.offset_sd] * size), _KNOTS if sensor.drift_sd else 0
+        step = sensor.drift_sd / math.sqrt(_KNOTS)
+        drift = add([step] * (grows * (axes if sensor.paired else 1)))
+        groups = size // axes if sensor.paired else size
+        place, gain = add(sensor.place_sds), add([sensor.gain_sd] * groups if sensor.gain_sd else [])
+        turned, clock = (
             add([sd]).start if sd else None
-            for sd in (sensor.gain_sd, math.radians(sensor.turn_sd_deg) * paired, sensor.delay_sd_s)
+            for sd in (math.radians(sensor.turn_sd_deg) * paired, sensor.delay_sd_s)
         )
         values = sensor.predict(Needles(shapes, length / (shapes.shape[1] - 1)), axes)
         along.append(
             SensorFit(
                 sensor,
-                SensorSlots(offset, gain, turned, clock),
+                SensorSlots(offset, drift, place, gain, turned, clock),
                 axes,
                 sensor.model_error(values),
+                task.plan.target[0] / _KNOTS * np.arange(1.0, grows + 1.0),
                 np.zeros(0),
                 np.zeros((0, size)),
                 np.zeros(0, dtype=bool),

@@ -28,7 +28,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import ROUNDING_S, travel_time
 from flexneedle.simulator.state import State
 from flexneedle.simulator.zones import ZoneMap
-from flexneedle.types import STILL, UNKNOWN, Control, Lateral, Motion, Pose, X
+from flexneedle.types import STILL, UNKNOWN, Control, Lateral, Matrix, Motion, Pose, X
 
 _MOST_MOVES = 4  # times the planned steps; then the insertion fails
 _TOLERANCE_MM = 0.1  # by which a margin may be entered without a warning
@@ -262,7 +262,15 @@ def _make_period(
             "total": clocks[1] - clocks[0] + clocks[3] - clocks[2],
         },
         converged=state.converged and (truth is None or truth.converged),
+        sensors=observation.sensors,
+        tip_covariance=_covariance(estimate) if task.scenario.sensor or task.scenario.tracker.bias_sd_mm else None,
     )
+
+
+def _covariance(estimate: Estimate) -> Matrix | None:
+    """Return the covariance (3, 3) of the estimated tip (mm²), None for an estimate without one."""
+    covariance = getattr(estimate, "tip_covariance", None)
+    return None if covariance is None else tuple(map(tuple, covariance.tolist()))
 
 
 def _clearances(steering: Steering, period: Period, observation: Observation) -> dict[str, Any]:

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.loop.monitor.sensors import SensorMonitor, SensorState, check_frozen, check_readings
+from flexneedle.loop.monitor.sensors import SensorMonitor, check_frozen, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
-from flexneedle.types import OK, Verdict, VerdictKind, X
+from flexneedle.types import OK, SensorState, Verdict, VerdictKind, X
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.fusing import Watch, check_uncertain, read_sensors
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.loop.monitor.sensors import SensorState
 from flexneedle.loop.rig import Rig
 from flexneedle.ports import TipTracker
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import OK, VISIBLE, CheckedMeasurement, Measurement, Verdict, VerdictKind
+from flexneedle.types import OK, VISIBLE, CheckedMeasurement, Measurement, SensorState, Verdict, VerdictKind
 
 _PREDICTION_SDS = 3.0  # standard deviations of the prediction, added to the limit of the innovation
 _NO_MEASUREMENT = Measurement(0.0, None, None)

@@ -14,25 +14,6 @@ _REPEATS = 10
 
 
 @dataclass(frozen=True)
-class SensorState:
-    """A sensor after a period, for the record.
-
-    readings: of this period, with their verdicts; verdict: on the sensor: OK while it corrects the model; nis: normalised
-    square of the innovation, 1 on average, NaN without a good reading.
-    """
-
-    name: str
-    readings: tuple[CheckedReading, ...] = ()
-    verdict: Verdict = OK
-    nis: float = math.nan
-
-    @property
-    def good(self) -> tuple[Reading, ...]:
-        """The readings that correct the model."""
-        return tuple(one.reading for one in self.readings if one.verdict.ok) if self.verdict.ok else ()
-
-
-@dataclass(frozen=True)
 class SensorMonitor:
     """State of the monitor of one sensor. Frozen: `check` returns the next state.
 

@@ -28,7 +28,8 @@ class VirtualSensor:
         places, errors, self._rng, faults = rng.spawn(4)
         self._sensor, self._phantom, self._axes, self._depth, self._length = sensor, phantom, axes, depth, length
         self._mounted = sensor.mounted(places)
-        self._gain = 1.0 + errors.normal(0.0, sensor.gain_sd)
+        pairs = axes if sensor.paired else 1
+        self._gain = 1.0 + np.repeat(errors.normal(0.0, sensor.gain_sd, sensor.size(axes) // pairs), pairs)
         self._turn = errors.normal(0.0, math.radians(sensor.turn_sd_deg))
         self._offset = sensor.drawn_offset(errors, axes)
         self._drift = sensor.drawn_drift(errors, axes)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _PER_M = 1e-3
 _MODEL_PER_M = 0.02
+_STEP_MM = 1.0
 _MODEL_SHARE = 0.03  # of the curvature along the plan
 
 
@@ -24,8 +25,6 @@ class FbgErrors(SensorErrors):
 
     site_mm: NonNegative = 1.0
     """Largest displacement of each site along the needle."""
-    temperature_per_m: NonNegative = 0.02
-    """Standard deviation of an error of all sites that grows to the target's depth: what is left of the temperature."""
 
 
 class Fbg(Sensor):
@@ -45,9 +44,14 @@ class Fbg(Sensor):
     bias_per_m: NonNegative = 0.1
     """Prior standard deviation of the constant error of a curvature."""
     gain_sd: Annotated[float, Field(ge=0, le=1)] = 0.03
-    """Prior standard deviation of the gain error, relative."""
+    """Prior standard deviation of the gain error of each site, relative."""
+    site_sd_mm: NonNegative = 0.6
+    """Prior standard deviation of the place of each site along the needle."""
     turn_sd_deg: Annotated[float, Field(ge=0, le=90)] = 2.0
     """Prior standard deviation of the angle between the sensor's axes and the bevel's, in space."""
+    temperature_per_m: NonNegative = 0.01
+    """Standard deviation of an error of all sites that has grown at the target's depth: what the compensation of the
+    temperature leaves."""
     wander_per_m: NonNegative = 0.0
     """Standard deviation of noise that is correlated over `wander_s`."""
     phantom: FbgErrors = FbgErrors()
@@ -70,6 +74,11 @@ class Fbg(Sensor):
         return _PER_M * self.bias_per_m
 
     @property
+    def drift_sd(self) -> float:
+        """Standard deviation of the drift down to the target's depth, 1/mm."""
+        return _PER_M * self.temperature_per_m
+
+    @property
     def wander_sd(self) -> float:
         """Standard deviation of the correlated noise, 1/mm."""
         return _PER_M * self.wander_per_m
@@ -77,6 +86,11 @@ class Fbg(Sensor):
     def size(self, axes: int) -> int:
         """Return the number of curvatures."""
         return axes * len(self.sites_mm)
+
+    @property
+    def place_sds(self) -> tuple[float, ...]:
+        """Prior standard deviations of the distances of the sites from the tip, mm."""
+        return (self.site_sd_mm,) * len(self.sites_mm) if self.site_sd_mm else ()
 
     @property
     def rolls(self) -> bool:
@@ -90,6 +104,14 @@ class Fbg(Sensor):
         bent = (tilts_at(needles, near) - tilts_at(needles, far))[..., :axes] / (far - near)[:, None]
         return bent.reshape(len(bent), -1)
 
+    def slopes(self, needles: Needles, axes: int) -> "Floats":
+        """Return the derivatives (m, d, s), 1/mm², to the distances of the sites from the tip."""
+        if not self.place_sds:
+            return super().slopes(needles, axes)
+        further = self.model_copy(update={"sites_mm": tuple(site + _STEP_MM for site in self.sites_mm)})
+        change = (further.predict(needles, axes) - self.predict(needles, axes)) / _STEP_MM
+        return change[:, :, None] * np.repeat(np.eye(len(self.sites_mm)), axes, axis=0)
+
     def model_error(self, planned: "Floats") -> "Floats":
         """Return standard deviations (d,), 1/mm: a constant, and a share of the curvature along the plan."""
         return np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * np.sqrt(np.mean(planned**2, axis=0)))
@@ -98,11 +120,6 @@ class Fbg(Sensor):
         """Return the sensor with its sites displaced."""
         most = min(self.phantom.site_mm, 0.4 * min(np.diff(self.sites_mm, prepend=0.0)))
         return self.model_copy(update={"sites_mm": tuple(perturbed(self.sites_mm, most, rng))})
-
-    def drawn_drift(self, rng: np.random.Generator, axes: int) -> "Floats":
-        """Return the error (d,), 1/mm, that grows to the target's depth: of the temperature, the same at all sites."""
-        drift: Any = rng.normal(0.0, _PER_M * self.phantom.temperature_per_m, axes)
-        return np.tile(drift, len(self.sites_mm))
 
 
 def tilts_at(needles: Needles, distances: "Floats") -> "Floats":

@@ -2,11 +2,11 @@
 
 A kind says what an error-free sensor measures on a needle, and how large the errors are. A reading is
 
-    (1 + g) e^(i(ρ − φ)) q + o + w + ε
+    (1 + g) e^(i(ρ − φ)) (q + q' p) + o + w + ε
 
-with the quantity q of the needle, gain error g, turn ρ, offset o, wander w (correlated over time) and white noise ε; φ is
-the angle of the needle for a sensor that rolls with it, else 0. Units of values are those that the kind chooses, the
-same in all of its methods.
+with the quantity q of the needle, its derivative q' to the places p of the sensor, gain error g, turn ρ, offset o, wander
+w (correlated over time) and white noise ε; φ is the angle of the needle for a sensor that rolls with it, else 0. Units
+of values are those that the kind chooses, the same in all of its methods.
 """
 
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ class Sensor(Section):
     delay_sd_s: NonNegative = 0.0
     """Prior standard deviation of the error of time stamps. 0: they are exact."""
     gain_sd: Fraction = 0.0
-    """Prior standard deviation of the gain error, relative."""
+    """Prior standard deviation of the gain error of each pair of values, relative."""
     turn_sd_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
     """Prior standard deviation of the turn of the sensor's lateral axes about the needle; in space."""
     wander_s: Positive = 10.0
@@ -91,6 +91,16 @@ class Sensor(Section):
     @property
     def offset_sd(self) -> float:
         """Prior standard deviation of the constant error of a value."""
+        return 0.0
+
+    @property
+    def place_sds(self) -> tuple[float, ...]:
+        """Prior standard deviations of the places p of the sensor, such as of each site (default: all are known)."""
+        return ()
+
+    @property
+    def drift_sd(self) -> float:
+        """Standard deviation of an error of all values that grows from the skin to the target's depth."""
         return 0.0
 
     @property
@@ -124,6 +134,10 @@ class Sensor(Section):
         """
         raise NotImplementedError
 
+    def slopes(self, needles: Needles, axes: int) -> "Floats":
+        """Return the derivatives (m, d, p) of the values to the places of the sensor."""
+        return np.zeros((len(needles.poses), self.size(axes), 0))
+
     def sees(self, needles: Needles, axes: int) -> "Flags":
         """Return which values (m, d) the sensor can measure on needles (default: all)."""
         return np.ones((len(needles.points), self.size(axes)), dtype=bool)
@@ -148,9 +162,9 @@ class Sensor(Section):
         return self
 
     def drawn_drift(self, rng: np.random.Generator, axes: int) -> "Floats":
-        """Return the error (d,) of the virtual sensor that grows evenly from the start to the target's depth."""
-        del rng
-        return np.zeros(self.size(axes))
+        """Return the error (d,) of the virtual sensor at the target's depth, to which it grows evenly from the skin."""
+        width = axes if self.paired else 1
+        return np.tile(rng.normal(0.0, self.drift_sd, width), self.size(axes) // width)
 
     def drawn_offset(self, rng: np.random.Generator, axes: int) -> "Floats":
         """Return the offset (d,) of the virtual sensor."""
