@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _PER_M = 1e-3
-_MODEL_PER_M = 0.02
+_MODEL_PER_M = 0.01
 _STEP_MM = 1.0
 _MODEL_SHARE = 0.03  # of the curvature along the plan
 
