@@ -145,7 +145,9 @@ def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
         return np.full(size, np.nan)
     values: Floats = np.array(rows)[:, :axes].ravel()
     if values.size != size:
-        raise ValueError(f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}")
+        raise ValueError(
+            f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}"
+        )
     return values
 
 
