@@ -31,13 +31,13 @@ class Gratings:
         if settings.get("fails"):
             raise RuntimeError("no light")
         self.settings, self.clock, self.sensor = settings, clock, sensor
-        self.count, self.closed, self.result = int(clock.now() / 0.02), False, None
+        self.count, self.closed, self.result = int(50.0 * clock.now() + 1e-6), False, None
         Gratings.opened.append(self)
 
     def read(self):
         if self.result is not None:
             return self.result
-        due = int(self.clock.now() / 0.02)
+        due = int(50.0 * self.clock.now() + 1e-6)
         taken, self.count = range(self.count, due), due
         return tuple(Reading(0.02 * n, ((1e-3, 2e-3),) * len(self.sensor.sites_mm)) for n in taken)
 
