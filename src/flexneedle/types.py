@@ -317,26 +317,24 @@ class Measurement:
                 object.__setattr__(self, name, check_covariance(name, matrix, size))
 
 
-@dataclass(frozen=True, eq=False)
-class Needles:
-    """Shapes of a needle at m instants, at n nodes equally spaced along it, base to tip.
+class Needles(NamedTuple):
+    """Shapes of a needle at m instants, by n nodes at equal distances along it, base to tip.
 
-    points (m, n, 3): x, y, z (mm); tilts (m, n, 2): angle of its axis from x (rad), in the directions y and z; roll
-    (m,): angle of the needle about its axis (rad); spacing: distance of two nodes along the needle (mm).
+    poses (m, n, 5): x, y, z (mm), slopes dy/dx and dz/dx; spacing: distance of two nodes along the needle (mm).
     """
 
-    points: Floats
-    tilts: Floats
-    roll: Floats
+    poses: Floats
     spacing: float
 
-    @staticmethod
-    def of(poses: Floats, roll: Floats, length: float) -> "Needles":
-        """Return the needles of poses (m, n, 5), whose slopes are dy/dx and dz/dx; length: of the needle (mm)."""
-        size = np.hypot(poses[..., THETA], poses[..., PSI])
-        share = np.divide(np.arctan(size), size, out=np.ones_like(size), where=size > 0.0)
-        tilts = share[..., None] * poses[..., THETA:]
-        return Needles(poses[..., : Z + 1], tilts, roll, length / (poses.shape[1] - 1))
+    @property
+    def points(self) -> Floats:
+        """x, y, z (m, n, 3), mm."""
+        return self.poses[..., : Z + 1]
+
+    @property
+    def slopes(self) -> Floats:
+        """Slopes dy/dx and dz/dx (m, n, 2)."""
+        return self.poses[..., THETA:]
 
 
 @dataclass(frozen=True)
@@ -381,6 +379,9 @@ class VerdictKind(StrEnum):
     FIELD_UNKNOWN = "field not known"
     FIELD_DISTORTED = "field distorted"
     FIELD_IN_DOUBT = "field in doubt"
+    OUTLIER = "outlier"
+    CONTRADICTED = "contradicted"
+    UNCERTAIN = "tip uncertain"
 
 
 @dataclass(frozen=True)
@@ -407,6 +408,14 @@ class CheckedMeasurement:
     """A tracker reading and its verdict: "ok", or the reason for the rejection."""
 
     measurement: Measurement
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class CheckedReading:
+    """A reading of a sensor along the needle and its verdict: "ok", or the reason for the rejection."""
+
+    reading: Reading
     verdict: Verdict
 
 

@@ -100,7 +100,8 @@ class Outlook:
         """Return standard deviations (d,), mm, on an axis, of the end if uncorrected, after readings down to depths."""
         end, to_come = self.at(target), self.grid > estimate.state.tip[X]
         slopes = np.where((to_come & (self.grid <= depths[:, None]))[:, None], self.curves, 0.0)
-        then = estimate.precision + (slopes @ slopes.conj().swapaxes(1, 2)).real / estimate.reading_variance
+        variance = estimate.reading_variance if estimate.tracked else np.inf
+        then = estimate.precision + (slopes @ slopes.conj().swapaxes(1, 2)).real / variance
         sd: Floats = np.sqrt((np.linalg.solve(then, end[:, None])[..., 0] @ end.conj()).real / estimate.axes)
         return sd
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
@@ -36,6 +37,19 @@ def play_prior(control: ControlSettings) -> Floats:
     prior[:2, :2] = axial_prior(control)
     prior[::2, ::2] += _PLAY_SD**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
     return prior
+
+
+def axial_errors_prior(scenario: Scenario) -> Floats:
+    """Return the prior covariance of start error, scale and play, and of the tracker's constant error where it has one.
+
+    See `play_prior`; (3, 3) or (4, 4).
+    """
+    prior, bias = play_prior(scenario.control), scenario.tracker.bias_sd_mm
+    if bias == 0.0:
+        return prior
+    wider = np.diag([0.0, 0.0, 0.0, bias**2])
+    wider[:3, :3] = prior
+    return wider
 
 
 def rest_variance(depth: Floats, turns: NDArray[np.bool_]) -> Floats:

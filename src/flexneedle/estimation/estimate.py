@@ -1,12 +1,16 @@
 """Interface of all observers: the estimated needle, corrected by delayed readings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Protocol
 
 from flexneedle.estimation.axial import EvenAdvance
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import THETA, Floats, Measurement, Motion, Point
+from flexneedle.types import THETA, Floats, Measurement, Motion, Point, Reading
+
+NONE: Mapping[str, Sequence[Reading]] = MappingProxyType({})
+"""No sensors along the needle."""
 
 
 class Estimate(Protocol):
@@ -57,15 +61,23 @@ class Estimate(Protocol):
         ...
 
     def tip_at(self, time: float) -> Point:
-        """Return the estimated position of the tip (mm) at `time`, with constant velocity in each move."""
+        """Return the position of the tip (mm) that the tracker should measure at `time`.
+
+        Its velocity is constant in each move.
+        """
         ...
 
     def move(self, motion: Motion) -> "Estimate":
         """Return the estimate after a motion as the driver carried it out; limits of commands do not apply."""
         ...
 
-    def observe(self, measurements: Sequence[Measurement]) -> "Estimate":
-        """Return the estimate corrected by good readings, the newest last."""
+    def observe(
+        self, measurements: Sequence[Measurement], along: Mapping[str, Sequence[Reading]] = NONE
+    ) -> "Estimate":
+        """Return the estimate corrected by good readings, the newest last.
+
+        along: of the sensors along the needle, by name.
+        """
         ...
 
     def without_reading(self) -> "Estimate":

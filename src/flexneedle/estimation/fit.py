@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexneedle.estimation.along import Bins, SensorFit, between, whiten
 from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, Simulated, adapt_models
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
-from flexneedle.types import Floats, Laterals, X, laterals
+from flexneedle.types import DB_X, Floats, Laterals, X, laterals
 
 _SHARES = (0.5, 0.2, 0.05, 0.0)  # of a step that raises the cost: the first that does not
 
@@ -35,16 +36,24 @@ def improve_fit(fitted: Fitted) -> Fitted:
     jacobian = jacobian_of(fitted)
     both = zip(fitted.variances(), fitted.readings, fitted.laterals, strict=True)
     variance = np.concatenate([noise + readings.estimate_sag(tips) ** 2 for noise, readings, tips in both])
+    left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
+    whitening = Whitening.of(fitted, variance)
+    if whitening:
+        jacobian, left, variance = whitening.of_rows(jacobian), whitening.of_rows(left), np.ones_like(variance)
     weighted = jacobian.conj().T / variance
-    off = fitted.parameters - prior.mean
-    gradient = (weighted @ np.concatenate(fitted.residuals)).real - prior.precision @ off
+    gradient = (weighted @ left).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
+    if fitted.along:
+        more, known = inform_along(fitted)
+        gradient, precision = gradient + more, precision + known
     fitted = fitted.change(precision=precision)
     goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
 
     def cost(other: FittedInsertion) -> float:
-        squares = np.abs(np.concatenate(other.residuals)) ** 2
-        return float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
+        left = np.concatenate(other.residuals)
+        squares = np.abs(whitening.of_rows(left) if whitening else left) ** 2
+        own = float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
+        return own + cost_along(other) if other.along else own
 
     most = cost(fitted)
 
@@ -93,8 +102,68 @@ def jacobian_of(fitted: FittedInsertion) -> Laterals:
         part = fitted.slopes(readings.between(fitted.tips[:, X]), k)
         offset = np.multiply.outer(readings.bevel, directions(1.0, fitted.axes))
         part[:, getattr(fitted.slots, sensor.offset)] = offset
+        if k == 0 and fitted.slots.bias.stop:
+            part[:, fitted.slots.bias] = directions(1.0, fitted.axes)
         parts.append(part)
     return np.concatenate(parts)
+
+
+class Whitening(NamedTuple):
+    """Rows of the tip's position, which come first, with the correlated error of the tracker's field made white."""
+
+    lower: Floats  # Cholesky factor (r, r) of the covariance of the position's rows
+    variance: Floats  # variances of all rows without that error
+
+    @staticmethod
+    def of(fitted: FittedInsertion, variance: Floats) -> "Whitening | None":
+        """Return the whitening of rows with variances (r,); None for a field without error."""
+        if fitted.field_sd == 0.0:
+            return None
+        position = fitted.readings[0]
+        path = np.cumsum(np.append(0.0, np.abs(fitted.rows[:, DB_X])))
+        length = fitted.nominal.scenario.tracker.field_length_mm
+        count, place = len(position.index), position.between(path) / length
+        correlated = np.exp(-np.abs(place[:, None] - place))
+        covariance = np.diag(variance[:count]) + fitted.field_sd**2 * correlated
+        return Whitening(np.linalg.cholesky(covariance), variance)
+
+    def of_rows(self, rows: Laterals) -> Laterals:
+        """Return rows (r, …) with white noise of variance 1."""
+        count = len(self.lower)
+        rest = (rows[count:].T / np.sqrt(self.variance[count:])).T
+        return np.concatenate([np.linalg.solve(self.lower, rows[:count]), rest])
+
+
+def inform_along(fitted: FittedInsertion) -> tuple[Floats, Floats]:
+    """Return what the sensors along the needle add to the gradient (K,) and to the precision (K, K)."""
+    gradient = np.zeros(fitted.parameters.size)
+    precision = np.zeros((gradient.size, gradient.size))
+    for k, one in enumerate(fitted.along):
+        bins, ends = fitted.bins[k], fitted.quantities[k]
+        slopes = fitted.along_slopes(between(bins, fitted.tips[:, X, None])[:, 0], k)
+        jacobian = one.jacobian(bins, ends, slopes, fitted.parameters, fitted.timeline)
+        for left, rows in _whitened(one, bins, fitted.along_residuals[k], jacobian):
+            gradient += rows.T @ left
+            precision += rows.T @ rows
+    return gradient, precision
+
+
+def cost_along(fitted: FittedInsertion) -> float:
+    """Return half of the weighted squares of the residuals of the sensors along the needle."""
+    parts = zip(fitted.along, fitted.bins, fitted.along_residuals, strict=True)
+    whitened = (left for one, bins, residuals in parts for left, *_ in _whitened(one, bins, residuals))
+    return float(sum(0.5 * (left**2).sum() for left in whitened))
+
+
+def _whitened(one: SensorFit, bins: Bins, *arrays: Floats) -> Iterator[list[Floats]]:
+    """Yield arrays (b, d, …) as rows with white noise of variance 1, in groups of columns with the same variances."""
+    variances = one.variances(bins)
+    wander, distance = one.sensor.wander_sd, bins.time / one.sensor.wander_s
+    if wander == 0.0:
+        yield whiten([each.reshape(variances.size, *each.shape[2:]) for each in arrays], variances.ravel(), 0.0, distance)
+        return
+    for k, variance in enumerate(variances.T):
+        yield whiten([each[:, k] for each in arrays], variance, wander, distance)
 
 
 ROUND = 8
@@ -120,7 +189,7 @@ def _enlarge(fitted: FittedInsertion, parameters: Floats, which: Sequence[int]) 
 def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
     """Return the insertion with its curves renewed from needles, a few steps ahead (default: those that are due)."""
     needles = needles or simulate_due(fitted, fitted.parameters)
-    models, states, tips = needles.simulated
+    models, states, tips, shapes = needles.simulated
     others = [k for k in needles.due if k not in needles.begun]
     larger = _enlarge(fitted, fitted.parameters, others)
     unreached = zip(
@@ -128,20 +197,39 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
     )
     ahead = controls(ROUND, db_x=fitted.nominal.scenario.setup.max_advance_mm)
     rows = np.tile(ahead, (len(models), 1, 1))
-    later = fitted.nominal.rollout(states, rows, models=models, limits=False).tips
-    base, *moved = np.concatenate([tips, later], axis=1)
+    further = fitted.nominal.rollout(states, rows, models=models, limits=False, outputs=fitted.wanted)
+    base, *moved = np.concatenate([tips, further.tips], axis=1)
     depth, curves = np.maximum.accumulate(base[:, X]), fitted.curves.copy()
     steps = fitted.prior.steps.tolist()
     for k, tip in zip(needles.begun, moved, strict=True):
         for curve, sensor in zip(curves[:, k], fitted.sensors, strict=True):
             change = laterals(tip, sensor.column, fitted.axes) - laterals(base, sensor.column, fitted.axes)
             curve[:] = np.interp(fitted.grid, depth, change / steps[k])
+    along_curves = fitted.along_curves
+    if fitted.along and needles.begun:
+        whole = fitted.quantities_of(np.concatenate([shapes, further.shapes], axis=1))
+        along_curves = tuple(
+            _renew(old, needles.begun, (each[1:] - each[0]) / fitted.prior.steps[needles.begun, None, None], depth, fitted.grid)
+            for old, each in zip(along_curves, whole, strict=True)
+        )
     reached = zip(needles.begun, models[1:], states[1:], strict=True)
     perturbed = (
         *(Perturbed(k, steps[k], model, state) for k, model, state in reached),
         *(Perturbed(k, steps[k], model, fitted.state) for k, model in unreached),
     )
-    return fitted.change(curves=curves, perturbed=perturbed, period=fitted.period + 1)
+    return fitted.change(
+        curves=curves, along_curves=along_curves, perturbed=perturbed, period=fitted.period + 1
+    )
+
+
+def _renew(curves: Floats, which: Sequence[int], slopes: Floats, depth: Floats, grid: Floats) -> Floats:
+    """Return curves (K, g, d) with those of some parameters from slopes (k, m, d) at depths (m,), which do not fall."""
+    right = np.clip(np.searchsorted(depth, grid, side="right"), 1, depth.size - 1)
+    width = depth[right] - depth[right - 1]
+    part = np.clip((grid - depth[right - 1]) / np.where(width > 0.0, width, 1.0), 0.0, 1.0)[:, None]
+    renewed = curves.copy()
+    renewed[which] = (1.0 - part) * slopes[:, right - 1] + part * slopes[:, right]
+    return renewed
 
 
 def due_parameters(fitted: FittedInsertion) -> Iterator[int]:
@@ -151,6 +239,6 @@ def due_parameters(fitted: FittedInsertion) -> Iterator[int]:
     of different periods would differ by more, and tell them apart where no reading does.
     """
     yield from (*range(fitted.slots.run_out.start), fitted.slots.bevel, fitted.slots.clearance)
-    for k in range(fitted.slots.modulus, fitted.parameters.size):
+    for k in range(fitted.slots.modulus, fitted.slots.end or fitted.parameters.size):
         if k % ROUND == fitted.period % ROUND:
             yield k

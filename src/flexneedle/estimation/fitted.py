@@ -1,13 +1,14 @@
 """The insertion simulated with fitted parameters, and its readings."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.estimation.along import Bins, SensorFit, Timeline
 from flexneedle.estimation.axial import scale_advance
 from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.move_means import MoveMeans
@@ -40,6 +41,7 @@ class Simulated(NamedTuple):
     models: list[Model]
     states: list[State]
     tips: Floats
+    shapes: Floats  # poses (P, m + 1, n, 5) of the nodes, of size 0 without sensors along the needle
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +66,16 @@ class FittedInsertion:
     # the present needle with one parameter changed, for some parameters
     perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
+    slots: Slots = field(kw_only=True)  # places of the parameters
+    along: tuple[SensorFit, ...] = ()  # sensors along the needle
+    quantities: tuple[Floats, ...] = ()  # their values (m + 1, d) at the ends of the moves
+    along_curves: tuple[Floats, ...] = ()  # derivatives (K, g, d) of their values over the depths
+    field_sd: float = 0.0  # of the tracker's error that is correlated along the path (mm)
 
     @property
     def axes(self) -> int:
         """Lateral axes."""
         return self.nominal.scenario.setup.axes
-
-    @cached_property
-    def slots(self) -> Slots:
-        """Places of the parameters."""
-        return Slots.of(self.nominal.scenario)
 
     @cached_property
     def rows(self) -> Floats:
@@ -130,7 +132,39 @@ class FittedInsertion:
         ]
         position = self.readings[0]
         residuals[0] -= self.lead[position.index] * position.between(self.slope)
+        if self.slots.bias.stop:
+            residuals[0] -= from_components(self.parameters[self.slots.bias])
         return residuals
+
+    @cached_property
+    def timeline(self) -> Timeline:
+        """Times of the moves, and the needle's angle."""
+        return Timeline.of(self.moves, self.start.roll)
+
+    @cached_property
+    def bins(self) -> list[Bins]:
+        """Means of the readings of each sensor along the needle."""
+        return [one.bins(self.timeline, one.parameter(self.parameters, "clock")) for one in self.along]
+
+    @cached_property
+    def along_residuals(self) -> list[Floats]:
+        """Residuals (b, d) of the sensors along the needle: means minus the model's values."""
+        parts = zip(self.along, self.bins, self.quantities, strict=True)
+        return [bins.value - one.expected(bins, ends, self.parameters) for one, bins, ends in parts]
+
+    def along_slopes(self, depth: Floats, sensor: int) -> Floats:
+        """Return derivatives (b, K, d) of the quantities of a sensor along the needle at depths (b,), mm."""
+        left, part = self._places(depth)
+        curves = self.along_curves[sensor]
+        slopes = (1.0 - part)[:, None] * curves[:, left] + part[:, None] * curves[:, left + 1]
+        return slopes.transpose(1, 0, 2)
+
+    def _places(self, depth: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """Return the points of the grid before depths (n,), mm, and the shares of the steps to the next."""
+        step = self.grid[1] - self.grid[0]
+        place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
+        left = place.astype(int)
+        return left, place - left
 
     @cached_property
     def slope(self) -> Laterals:
@@ -139,10 +173,7 @@ class FittedInsertion:
 
     def slopes(self, depth: Floats, sensor: int = 0) -> Laterals:
         """Return derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""
-        step = self.grid[1] - self.grid[0]
-        place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
-        left = place.astype(int)
-        part = place - left
+        left, part = self._places(depth)
         curves = self.curves[sensor]
         slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
         return slopes
@@ -156,11 +187,13 @@ class FittedInsertion:
     def change(self, **changes: Any) -> Self:
         """Return the insertion with changes; properties of what has not changed are kept."""
         fields = {name: vars(self)[name] for name in self.__dataclass_fields__}
-        made, kept = type(self)(**{**fields, **changes}), ["slots", "sensors"]
+        made, kept = type(self)(**{**fields, **changes}), ["sensors"]
         if made.precision is self.precision:
             kept.append("covariance")
         if made.moves is self.moves:
-            kept += ["rows", "readings"] if made.state.bevel == self.state.bevel else ["rows"]
+            kept += ["rows", "timeline"] + ["readings"] * (made.state.bevel == self.state.bevel)
+            if made.along is self.along and all(one.slots.clock is None for one in self.along):
+                kept.append("bins")
         vars(made).update({name: vars(self)[name] for name in kept if name in vars(self)})
         return made
 
@@ -175,11 +208,25 @@ class FittedInsertion:
 
     def take(self, parameters: Floats, simulated: Simulated, number: int = 0) -> Self:
         """Return the insertion with parameters (K,) and the needle that was simulated with them."""
-        models, states, tips = simulated
+        models, states, tips, shapes = simulated
         simulator = self.nominal.with_model(models[number])
         return self.change(
-            simulator=simulator, parameters=parameters, state=states[number], tips=tips[number]
+            simulator=simulator,
+            parameters=parameters,
+            state=states[number],
+            tips=tips[number],
+            quantities=self.quantities_of(shapes[number]) if self.along else (),
         )
+
+    def quantities_of(self, shapes: Floats) -> tuple[Floats, ...]:
+        """Return the values (…, d) of each sensor along the needle on shapes (…, n, 5)."""
+        length = self.nominal.scenario.needle.length_mm
+        return tuple(one.quantities(shapes, length) for one in self.along)
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Outputs of the rollouts."""
+        return ("shapes",) if self.along else ()
 
     def simulate_all(self, parameters: Sequence[Floats]) -> Simulated:
         """Return the insertion simulated again with each set of parameters, (K,) each."""
@@ -195,8 +242,10 @@ class FittedInsertion:
             models=models,
             limits=False,
             ends=True,
+            outputs=self.wanted,
         )
-        return Simulated(models, [state.discount_advance(extra) for state in found.ends], found.tips)
+        states = [state.discount_advance(extra) for state in found.ends]
+        return Simulated(models, states, found.tips, found.shapes)
 
     def _place_start(self, parameters: Floats) -> State:
         """Return the start with these parameters (K,), not settled."""
@@ -223,13 +272,13 @@ def adapt_models(nominal: Simulator, slots: Slots, cell: float, parameters: Sequ
     tissues: dict[bytes, Model] = {}
     models = []
     for each in parameters:
-        key = each[slots.modulus :].tobytes()
+        key = each[slots.modulus : slots.end].tobytes()
         if key not in tissues:
             tissue = Adaptation(
                 shift=each[shift:variation],
                 stiffness=np.exp(each[slots.modulus : shift]),
                 cell=cell,
-                variation=np.exp(each[variation:]),
+                variation=np.exp(each[variation : slots.end]),
             )
             tissues[key] = adapt(nominal.model, tissue)
         needle = float(each[slots.bevel]), from_components(each[slots.bend]), float(each[slots.clearance])

@@ -14,32 +14,36 @@ and added as a constant.
 """
 
 import cmath
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import takewhile
 
 import numpy as np
 
+from flexneedle.estimation.along import Comparison, SensorFit, SensorSlots, between
 from flexneedle.estimation.axial import (
     AS_COMMANDED,
     EvenAdvance,
+    axial_errors_prior,
     axial_variance,
     fit_axial_error,
     fit_even_advance,
-    play_prior,
     replay_scaled,
     rest_variance,
 )
-from flexneedle.estimation.estimate import describe_estimate
-from flexneedle.estimation.fit import ROUND, differentiate, improve_fit, simulate_due
+from flexneedle.estimation.estimate import NONE, describe_estimate
+from flexneedle.estimation.fit import ROUND, Whitening, differentiate, improve_fit, simulate_due
 from flexneedle.estimation.fitted import FittedInsertion
-from flexneedle.estimation.lateral import directions, from_components, variance_of
+from flexneedle.estimation.lateral import components, directions, from_components, variance_of
 from flexneedle.estimation.moves import Move, assign_readings, position_along
-from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, check_cells
+from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Point, X, Z
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Needles, Point, Reading, X, Z
 
 _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
@@ -55,10 +59,12 @@ class Identification:
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         check_cells(scenario, settings)
         state, prior = simulator.start(task.plan.roll), Prior.of(scenario, settings, task.plan.target[0])
+        prior, slots, along = add_sensors(prior, task, state)
         step = scenario.setup.max_advance_mm
         grid = np.arange(
             scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (ROUND + 6) * step, step
         )
+        length = scenario.needle.length_mm
         start = Identified(
             simulator,
             settings,
@@ -74,7 +80,12 @@ class Identification:
                 dtype=float if scenario.setup.axes == 1 else complex,
             ),
             prior.precision,
-            axial_covariance=play_prior(scenario.control),
+            axial_covariance=axial_errors_prior(scenario),
+            slots=slots,
+            along=along,
+            quantities=tuple(one.quantities(state.nodes[None], length) for one in along),
+            along_curves=tuple(np.zeros((prior.mean.size, grid.size, one.model_sd.size)) for one in along),
+            field_sd=scenario.tracker.field_sd_mm,
         )
         return differentiate(start, simulate_due(start, prior.mean, range(prior.mean.size)))
 
@@ -86,6 +97,7 @@ class Identified(FittedInsertion):
     axial_covariance: Floats = field(
         default_factory=lambda: np.zeros((3, 3))
     )  # of axial (mm), axial_scale and play (mm)
+    axial_bias: float = 0.0  # constant error of the tracker along the axis (mm)
     even_advance: EvenAdvance = AS_COMMANDED
     residual: complex = 0.0  # low-passed residual (mm)
     innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
@@ -113,12 +125,13 @@ class Identified(FittedInsertion):
         return self.run_out * bevel + self.residual
 
     def tip_at(self, time: float) -> Point:
-        """Return the estimated position of the tip (mm) at `time`."""
+        """Return the position of the tip (mm) that the tracker should measure at `time`."""
         x, y, z = position_along(self.moves, self.tips, time, self.lead)
         running = takewhile(lambda done: time < done.motion.ended, reversed(self.moves))
         left = sum(done.left_to_turn(time) for done in running)
         off = self.off_axis(self.state.bevel * cmath.exp(-1j * left))
-        return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
+        ahead, left, up = self.bias
+        return x + ahead, y + off.real + left, z + (off.imag if self.axes > 1 else 0.0) + up
 
     def without_reading(self) -> "Identified":
         """Return the estimate of a period without a good reading: innovation 0."""
@@ -131,19 +144,36 @@ class Identified(FittedInsertion):
             return self.change(moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)), perturbed=())
         new = Move.parts_of(motion)
         rows = np.array([done.applied for done in new])
-        state, tips = replay_scaled(self.simulator, self.state, rows, self.axial_scale)
-        tips = np.concatenate([self.tips, tips])
-        return self.change(state=state, tips=tips, moves=(*self.moves, *new), perturbed=())
+        state, tips, quantities = self.state, self.tips, self.quantities
+        for part in rows[:, None] if self.along else rows[None]:  # one by one, with the shape after each
+            state, more = replay_scaled(self.simulator, state, part, self.axial_scale)
+            tips = np.concatenate([tips, more])
+            if self.along:
+                ends = self.quantities_of(state.nodes[None])
+                quantities = tuple(np.concatenate(both) for both in zip(quantities, ends, strict=True))
+        return self.change(
+            state=state, tips=tips, moves=(*self.moves, *new), perturbed=(), quantities=quantities
+        )
 
-    def observe(self, measurements: Sequence[Measurement]) -> "Identified":
-        """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
-        if not measurements or not self.moves:
+    def observe(
+        self, measurements: Sequence[Measurement], along: Mapping[str, Sequence[Reading]] = NONE
+    ) -> "Identified":
+        """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them.
+
+        along: readings of sensors along the needle by name.
+        """
+        if not (measurements or any(along.values())) or not self.moves:
             return self.without_reading()
-        extended = self.change(moves=assign_readings(self.moves, measurements))._fit_axially()
+        extended = self.change(
+            moves=assign_readings(self.moves, measurements) if measurements else self.moves,
+            along=tuple(self._add(one, along.get(one.name, ())) for one in self.along),
+        )._fit_axially()
         readings = extended.readings[0]
         fitted = improve_fit(extended)
+        if not measurements or not len(readings.index):
+            return fitted.without_reading()
         left, lead = fitted.residuals[0], fitted.lead
-        ahead = readings.ahead(fitted.tips[:, X]) - lead[readings.index]
+        ahead = readings.ahead(fitted.tips[:, X]) - lead[readings.index] - fitted.axial_bias
         newest = int(readings.index[-1]) + 1
         since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])
         bevel = fitted.state.bevel * cmath.exp(-1j * since)
@@ -152,7 +182,7 @@ class Identified(FittedInsertion):
         y = complex(y + fitted.run_out * bevel)
         inside = fitted.tips[-1, X] > 0.0
         return fitted.change(
-            residual=low_pass(self.settings, left) if inside else 0.0,
+            residual=low_pass(self.settings, fitted.without_field(left)) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1].real), float(left[-1].imag)),
             measured=(x, y.real, y.imag if self.axes > 1 else 0.0),
         )
@@ -166,12 +196,19 @@ class Identified(FittedInsertion):
         moves_on = self.moves_on[readings.index]
         variance = readings.axial_variance(position.sd(scenario) or 0.0, unexplained)
         variance += np.where(moves_on, 0.0, rest_variance(readings.between(self.tips[:, X]), readings.turns))
-        columns, prior = np.stack([np.ones_like(travel), travel, moves_on]), play_prior(scenario.control)
+        columns, prior = np.stack([np.ones_like(travel), travel, moves_on]), axial_errors_prior(scenario)
+        if len(prior) > len(columns):
+            columns = np.concatenate([columns, np.ones_like(travel)[None]])
+        if self.field_sd:
+            field = Whitening.of(self, variance)
+            without, columns = field.of_rows(without), field.of_rows(columns.T).T
+            variance = np.ones_like(variance)
         found, covariance = fit_axial_error(without, columns, variance, prior)
         return self.change(
             axial=float(found[0]),
             axial_scale=1.0 + float(found[1]),
             play=float(found[2]),
+            axial_bias=float(found[3]) if len(found) > 3 else 0.0,
             axial_covariance=covariance,
             even_advance=fit_even_advance(without, columns, variance, prior),
         )
@@ -182,10 +219,70 @@ class Identified(FittedInsertion):
 
         At rest an unknown play would excuse lateral jumps.
         """
+        slope = self._tip_slope
+        if self.slots.bias.stop:
+            slope[self.slots.bias] = directions(1.0, self.axes)
+        axial = axial_variance(self.axial_covariance, self._axial_slope(1.0))
+        field = (self.axes + 1) * self.field_sd**2
+        return float(np.sqrt(variance_of(slope, self.covariance) + axial + field))
+
+    @property
+    def _tip_slope(self) -> Laterals:
+        """Derivatives (K,) of the tip's lateral position to the parameters."""
         slope = self.slopes(self.state.tip[:1])[0]
         slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
-        axial = axial_variance(self.axial_covariance, (1.0, float(self.state.travel[DB_X]), 1.0))
-        return float(np.sqrt(variance_of(slope, self.covariance) + axial))
+        return slope
+
+    def _axial_slope(self, bias: float) -> list[float]:
+        """Return the derivatives of the tip's x to the axial errors, of its reading with `bias` = 1."""
+        return [1.0, float(self.state.travel[DB_X]), 1.0, bias][: len(self.axial_covariance)]
+
+    @property
+    def tip_covariance(self) -> Floats:
+        """Covariance (3, 3) of the tip's x, y, z (mm²)."""
+        slope = self._tip_slope
+        parts = np.stack([slope.real, slope.imag])
+        covariance = np.zeros((3, 3))
+        covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
+        covariance[1:, 1:] = parts @ self.covariance @ parts.T
+        return covariance
+
+    @property
+    def bias(self) -> Point:
+        """Constant error x, y, z (mm) of the tracker; 0 where it is not estimated."""
+        y, z = components(self.parameters[self.slots.bias]) if self.slots.bias.stop else (0.0, 0.0)
+        return self.axial_bias, y, z
+
+    def without_field(self, left: Laterals) -> Laterals:
+        """Return residuals (r,) of the tip's position without the error of the tracker's field, as far as it is known."""
+        if self.field_sd == 0.0:
+            return left
+        field = Whitening.of(self, self.variances()[0])
+        lower = field.lower
+        covariance = lower @ lower.T - np.diag(field.variance)
+        return left - covariance @ np.linalg.solve(lower.T, np.linalg.solve(lower, left))
+
+    def _add(self, one: SensorFit, readings: Sequence[Reading]) -> SensorFit:
+        """Return a sensor along the needle with new readings."""
+        return one.add(np.array([each.time for each in readings]), self._values(one, readings)) if readings else one
+
+    def _values(self, one: SensorFit, readings: Sequence[Reading]) -> Floats:
+        """Return the values (r, d) of readings."""
+        length = self.nominal.scenario.needle.length_mm
+        needle = Needles(self.state.nodes[None], length / (len(self.state.nodes) - 1))
+        return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
+
+    def compare(self, name: str, readings: Sequence[Reading]) -> Comparison:
+        """Return readings (r,) of a sensor along the needle beside their predictions."""
+        k = next(k for k, one in enumerate(self.along) if one.name == name)
+        one, values = self.along[k], self._values(self.along[k], readings)
+        time, ends = np.array([each.time for each in readings]), self.quantities[k]
+        predicted = one.predict_at(time, ends, self.timeline, self.parameters)
+        bins = one.bin_at(time[-1:], self.timeline)
+        slopes = self.along_slopes(between(bins, self.tips[:, X, None])[:, 0], k)
+        jacobian = one.jacobian(bins, ends, slopes, self.parameters, self.timeline)[0]
+        known = jacobian @ self.covariance @ jacobian.T + np.diag(one.model_sd**2) + one.sensor.wander_sd**2 * np.eye(len(jacobian))
+        return Comparison(values, values - predicted, known, one.sensor.noise)
 
     def shape_sd(self, nodes: Floats) -> Floats:
         """Return standard deviations (n, 2), mm, of y and z at nodes (n, 5), as of a tip that passes there."""
@@ -239,8 +336,20 @@ class Identified(FittedInsertion):
     @property
     def lag(self) -> float:
         """Time (s) from the newest reading to the end of the last move."""
+        newest = max([self._tracked_at, *(float(one.time[-1]) for one in self.along if len(one.time))])
+        return self.moves[-1].motion.ended - newest if self.moves else 0.0
+
+    @property
+    def _tracked_at(self) -> float:
+        """Time (s) of the newest reading of the tracker, 0 before the first."""
         times = (one.time for done in reversed(self.moves) for one in reversed(done.measurements))
-        return self.moves[-1].motion.ended - next(times, 0.0) if self.moves else 0.0
+        return next(times, 0.0)
+
+    @property
+    def tracked(self) -> bool:
+        """True if the tracker measured the tip lately, so that it will again."""
+        limit = self.nominal.scenario.control.hold_limit_s
+        return not self.along or (bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit)
 
     @property
     def roll_sd(self) -> float:
@@ -259,6 +368,54 @@ class Identified(FittedInsertion):
         count = max(1.0, step / scenario.tracker.period)
         unexplained = self.sensors[0].unexplained(scenario, self.settings)
         return float(scenario.tracker.jitter_per_axis**2 / count + unexplained**2)
+
+
+def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, tuple[SensorFit, ...]]:
+    """Return the prior with the errors of tracker and sensors, the places of all parameters, and the sensors.
+
+    state: at the start. The model's error of a sensor is that along the plan.
+    """
+    scenario = task.scenario
+    slots, axes, length = Slots.of(scenario), scenario.setup.axes, scenario.needle.length_mm
+    own = prior.mean.size
+    sds: list[float] = []
+
+    def add(values: Sequence[float]) -> slice:
+        begin = own + len(sds)
+        sds.extend(values)
+        return slice(begin, own + len(sds))
+
+    bias = add([scenario.tracker.bias_sd_mm] * axes) if scenario.tracker.bias_sd_mm else slots.bias
+    along = []
+    shapes = planned_shapes(task, state) if scenario.sensor else np.zeros((0, 2, 5))
+    for sensor in scenario.sensor:
+        size, paired = sensor.size(axes), sensor.paired and axes == 2
+        offset = add([sensor.offset_sd] * size)
+        gain, turned, clock = (
+            add([sd]).start if sd else None
+            for sd in (sensor.gain_sd, math.radians(sensor.turn_sd_deg) * paired, sensor.delay_sd_s)
+        )
+        values = sensor.predict(Needles(shapes, length / (shapes.shape[1] - 1)), axes)
+        along.append(
+            SensorFit(
+                sensor,
+                SensorSlots(offset, gain, turned, clock),
+                axes,
+                sensor.model_error(values),
+                np.zeros(0),
+                np.zeros((0, size)),
+                np.zeros(0, dtype=bool),
+            )
+        )
+    if not sds:
+        return prior, slots, ()
+    return prior.extend(sds), slots._replace(end=own, bias=bias), tuple(along)
+
+
+def planned_shapes(task: Task, state: State) -> Floats:
+    """Return the poses (m, n, 5) of the needle along the plan, of the scenario's model."""
+    rows = task.plan.controls[None]
+    return task.simulator.rollout(state, rows, outputs=("shapes",), limits=False).shapes[0]
 
 
 def low_pass(settings: Priors, left: Laterals) -> complex:

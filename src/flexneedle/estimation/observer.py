@@ -9,7 +9,7 @@ fitted (recursive least squares with a prior). In tissue the measured tip is an 
 it needs, low-passed, remains as a tip load in the prediction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,13 +21,13 @@ from flexneedle.estimation.axial import (
     carry_out,
     fit_even_advance,
 )
-from flexneedle.estimation.estimate import describe_estimate
+from flexneedle.estimation.estimate import NONE, describe_estimate
 from flexneedle.estimation.moves import Move, assign_readings, drop_roll_readings, position_along, tip_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, STILL, THETA, Floats, Measurement, Motion, Point, X, Y, Z
+from flexneedle.types import DB_X, STILL, THETA, Floats, Measurement, Motion, Point, Reading, X, Y, Z
 
 _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model's error
 
@@ -133,7 +133,9 @@ class Corrected:
         """True if the last move was a rest, and no reading of it has arrived."""
         return bool(self.moves) and self.moves[-1].applied == STILL and not self.moves[-1].measurements
 
-    def observe(self, measurements: Sequence[Measurement]) -> "Corrected":
+    def observe(
+        self, measurements: Sequence[Measurement], along: Mapping[str, Sequence[Reading]] = NONE
+    ) -> "Corrected":
         """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived."""
         used = drop_roll_readings(self.moves, measurements)
         moves = assign_readings(self.moves, used)

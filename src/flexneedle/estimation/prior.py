@@ -5,6 +5,7 @@ offset, clearance in the guide (mm), ln of the factor on each layer's modulus, s
 layers, ln of a further factor on the modulus in cells along the depth, correlated over a length.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -22,7 +23,8 @@ class Slots(NamedTuple):
     """Places of the parameters.
 
     On each axis: base, slope, bend, run-out, and the tilt of a measured direction (the latter three relative to the
-    bevel's direction). Then the bevel factor, the clearance, and the first of the moduli.
+    bevel's direction). Then the bevel factor, the clearance, and the first of the moduli. After the last of these, errors
+    of the tracker and of other sensors.
     """
 
     base: slice
@@ -33,6 +35,8 @@ class Slots(NamedTuple):
     bevel: int
     clearance: int
     modulus: int
+    end: int | None = None  # of the parameters of needle and tissue, None: there are no others
+    bias: slice = slice(0, 0)  # constant error of the tracker across the needle
 
     @staticmethod
     def of(scenario: Scenario) -> "Slots":
@@ -45,8 +49,8 @@ class Slots(NamedTuple):
         return Slots(base, slope, bend, run_out, tilt, bevel, bevel + 1, bevel + 2)
 
     def is_offset(self, parameter: int) -> bool:
-        """Return whether a parameter is an offset of a measurement, without effect on the needle."""
-        return bool(self.run_out.start <= parameter < self.tilt.stop)
+        """Return whether a parameter is an error of a measurement, without effect on the needle."""
+        return self.run_out.start <= parameter < self.tilt.stop or self.end is not None and parameter >= self.end
 
 
 LEAST_SD = 1e-6
@@ -153,6 +157,20 @@ class Prior:
         """Covariance (K, K)."""
         found: Floats = np.linalg.inv(self.precision).astype(np.float64)
         return found
+
+    def extend(self, sds: Sequence[float]) -> "Prior":
+        """Return the prior with further independent parameters: errors of measurements, of mean 0."""
+        sd = np.maximum(sds, LEAST_SD)
+        own, size = self.mean.size, self.mean.size + sd.size
+        precision = np.zeros((size, size))
+        precision[:own, :own], precision[own:, own:] = self.precision, np.diag(sd**-2.0)
+        return Prior(
+            np.append(self.mean, np.zeros(sd.size)),
+            precision,
+            np.concatenate([self.bounds, np.outer((-_WIDEST, _WIDEST), sd)], axis=1),
+            np.append(self.steps, np.ones(sd.size)),
+            np.append(self.begins, np.full(sd.size, -np.inf)),
+        )
 
     def cost(self, parameters: Floats) -> float:
         """Return the negative logarithm of the density, up to a constant."""

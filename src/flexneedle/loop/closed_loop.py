@@ -18,7 +18,7 @@ from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.loop.events import PeriodEnded
 from flexneedle.loop.loop_state import LoopState, hold_after
-from flexneedle.loop.measuring import Observation, observe, observe_before_start
+from flexneedle.loop.measuring import Observation, observe_all, observe_before_start
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Steering, Step
@@ -110,8 +110,8 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
             rig.expect(state.observation.estimate, step.decision.command)
         motion = _carry_out(task.scenario, rig, step, begun)
         clocks.append(time.perf_counter())
-        predicted, monitor = state.observation.estimate.move(motion), state.observation.monitor
-        observation = observe(task.scenario, predicted, monitor, begun, rig.clock.now(), rig.tracker)
+        predicted = state.observation.estimate.move(motion)
+        observation = observe_all(task.scenario, state.observation, predicted, begun, rig.clock.now(), rig)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
         if motion.held:

@@ -5,7 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flexneedle.estimation.estimate import Estimate
+from flexneedle.loop.fusing import Watch, check_uncertain, read_sensors
 from flexneedle.loop.monitor.monitor import Monitor
+from flexneedle.loop.monitor.sensors import SensorState
+from flexneedle.loop.rig import Rig
 from flexneedle.ports import TipTracker
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import OK, VISIBLE, CheckedMeasurement, Measurement, Verdict, VerdictKind
@@ -19,7 +22,7 @@ class Observation:
     """The estimate after a period, and the readings with their verdicts.
 
     measurement: the reading to which the verdict of the period refers, empty if there is none; field: true if the
-    verdict is about the field rather than a reading.
+    verdict is about the field rather than a reading; sensors: the sensors along the needle, and watch, their monitors.
     """
 
     estimate: Estimate
@@ -28,10 +31,18 @@ class Observation:
     measurement: Measurement = _NO_MEASUREMENT
     verdict: Verdict = OK
     field: bool = False
+    watch: Watch = Watch()
+    sensors: tuple[SensorState, ...] = ()
 
     def has_good_reading_after(self, time: float) -> bool:
         """Return whether a good reading was taken after `time` (s)."""
-        return any(one.verdict.ok and one.measurement.time > time - 1e-6 for one in self.readings)
+        tip = any(one.verdict.ok and one.measurement.time > time - 1e-6 for one in self.readings)
+        return tip or any(one.time > time - 1e-6 for state in self.sensors for one in state.good)
+
+    @property
+    def newest(self) -> float:
+        """Time (s) of the newest good reading of any sensor, the period's measurement's without others."""
+        return max([self.measurement.time, *(one.time for state in self.sensors for one in state.good)])
 
     def hold_limit(self, scenario: Scenario) -> float:
         """Return the longest hold (s) for the verdict of this period."""
@@ -45,6 +56,8 @@ def observe_before_start(
 
     The estimate is not corrected.
     """
+    if not scenario.tracker.enabled:
+        return Observation(estimate, monitor)
     measurements = tracker.read()
     stale_after = scenario.control.stale_after_s
     if not measurements:
@@ -62,18 +75,44 @@ def observe_before_start(
     return Observation(estimate, monitor, readings, newest.measurement, newest.verdict)
 
 
+def observe_all(
+    scenario: Scenario, before: Observation, predicted: Estimate, begun: float, now: float, rig: Rig
+) -> Observation:
+    """Observe with all sensors: as `observe`, and by the sensors along the needle, if there are any.
+
+    Then the needle is held if the tip is not known well enough, and not because the tracker alone does not measure it.
+    """
+    if not scenario.sensor:
+        return observe(scenario, predicted, before.monitor, begun, now, rig.tracker)
+    watch, sensors = read_sensors(scenario, predicted, before.watch, begun, now, rig.sensors)
+    found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
+    tracker = found.verdict if scenario.tracker.enabled else Verdict(VerdictKind.MISSING, "there is none")
+    verdict = check_uncertain(scenario, found.estimate, sensors, str(tracker))
+    return replace(found, verdict=verdict, field=False, watch=watch, sensors=sensors)
+
+
 def observe(
-    scenario: Scenario, predicted: Estimate, monitor: Monitor, begun: float, now: float, tracker: TipTracker
+    scenario: Scenario,
+    predicted: Estimate,
+    monitor: Monitor,
+    begun: float,
+    now: float,
+    tracker: TipTracker,
+    sensors: Sequence[SensorState] = (),
 ) -> Observation:
     """Read the tracker, check readings and field, and correct the prediction by the good readings.
 
     begun, now: start and end (s) of the move after which `predicted` holds. While the field is distorted or in doubt no
-    reading is used.
+    reading of the tracker is used. sensors: along the needle, with their readings.
     """
     stale_after = scenario.control.stale_after_s
-    measurements = tracker.read()
+    measurements, along = tracker.read(), {one.name: one.good for one in sensors}
+
+    def correct(good: Sequence[Measurement]) -> Estimate:
+        return predicted.observe(good, along) if along else predicted.observe(good)
+
     if not measurements:
-        return _keep_last_reading(predicted, monitor, now, stale_after, tracker.status)
+        return _keep_last_reading(correct(()), monitor, now, stale_after, tracker.status)
     # All but the newest were in transit while the needle moved.
     max_ages = [stale_after + now - begun] * (len(measurements) - 1) + [stale_after]
     monitor, readings = _check_readings(scenario, predicted, monitor, measurements, max_ages, now)
@@ -82,12 +121,12 @@ def observe(
     if not field.ok:
         rejected = _reject_readings(readings, field)
         return Observation(
-            predicted.without_reading(), monitor, rejected, newest.measurement, field, field=True
+            correct(()).without_reading(), monitor, rejected, newest.measurement, field, field=True
         )
     if not (doubt := monitor.field_in_doubt()).ok:
         readings = _reject_readings(readings, doubt)
     good = [reading.measurement for reading in readings if reading.verdict.ok]
-    corrected = predicted.observe(good)
+    corrected = correct(good)
     estimate = corrected if good else corrected.without_reading()
     if newest.verdict.ok:
         return Observation(estimate, monitor, readings, newest.measurement)

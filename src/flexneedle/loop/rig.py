@@ -1,16 +1,16 @@
 """A rig: clock, driver and tracker of the closed loop, and the sources that provide it."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from flexneedle.arguments import make_refusal
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.events import Stream
 from flexneedle.phantom.phantom import Condition
-from flexneedle.ports import Clock, Driver, TipTracker
+from flexneedle.ports import Clock, Driver, NeedleSensor, TipTracker
 from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Control
@@ -60,6 +60,7 @@ class Rig(RigSource):
             estimate, and a refused one not at all.
         deadline: Time (s) of a decision after which it is late: the tracker is read again before it is used. None: no
             decision is late.
+        sensors: The scenario's sensors along the needle, by name.
 
     Raises:
         InputError: For a port without the functions of its protocol, and for a deadline that is not above 0.
@@ -71,11 +72,14 @@ class Rig(RigSource):
     truth: Callable[[], Condition] | None = None
     expect: Callable[[Estimate, Control], None] | None = None
     deadline: float | None = None
+    sensors: Mapping[str, NeedleSensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_port("clock", self.clock, Clock, ("now", "wait"))
         _check_port("driver", self.driver, Driver, ("apply", "stop"))
         _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
+        for name, sensor in self.sensors.items():
+            _check_port(f"sensors[{name!r}]", sensor, NeedleSensor, ("read", "status"))
         if not (self.truth is None or callable(self.truth)):
             raise make_refusal(
                 "truth", self.truth, "must be a function of () that returns a Condition, or None"

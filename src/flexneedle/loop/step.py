@@ -64,7 +64,7 @@ class Steering:
             held = Decision(STILL, why, predicted=state.predicted)
             return Step(Action.HOLD, held, reading), replace(state, late=None)
         if state.arrived_at is not None:
-            delay = begun - state.observation.measurement.time
+            delay = begun - state.observation.newest
             waiting = Decision(STILL, "waiting for the last reading", predicted=state.predicted)
             return Step(Action.REST, waiting, max(reading, delay)), state
         asked = self.stream.gate.hold()

@@ -15,9 +15,11 @@ from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
+from flexneedle.phantom.tracking.along import VirtualSensor
 from flexneedle.phantom.tracking.field.field_tracker import FieldTracker
 from flexneedle.phantom.tracking.field.poses import SensorPose, placed_references, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
+from flexneedle.phantom.tracking.none import NoTracker
 from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.phantom.tracking.stage import OnStage, tilt_of
 from flexneedle.plugins import find_part, function_rule
@@ -120,19 +122,30 @@ def virtual_rig(
     Raises InputError if the factory returns no tracker.
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
-    phantom = Phantom(truth, roll, plant)
-    if tracker is not None:
-        own = tracker(scenario, phantom, np.random.default_rng(seeds.tracker))
-        return Rig(phantom, phantom, own, phantom.condition)
+    phantom = Phantom(truth, roll, plant, keeps_shapes=bool(scenario.sensor))
+    sensors = virtual_sensors(scenario, phantom, seeds)
+    if tracker is not None or not scenario.tracker.enabled:
+        own = tracker(scenario, phantom, np.random.default_rng(seeds.tracker)) if tracker else NoTracker()
+        return Rig(phantom, phantom, own, phantom.condition, sensors=sensors)
     wrong = registration_error(scenario.tracker.registration, seeds.room)
     rng = np.random.default_rng(seeds.tracker)
     plate_distance = None if plate_distance_at is None else plate_distance_at(0.0)
     around = virtual_room(scenario, seeds.room, plate_distance)
     if around is None:
-        described: TipTracker = _noisy_tracker(scenario, phantom, truth.bias, wrong, rng)
+        described: TipTracker = _noisy_tracker(scenario, phantom, truth.bias, wrong, rng, truth.drift)
     else:
         described = _field_tracker(scenario, around, phantom, truth.bias, wrong, rng, plate_distance_at)
-    return Rig(phantom, phantom, described, phantom.condition)
+    return Rig(phantom, phantom, described, phantom.condition, sensors=sensors)
+
+
+def virtual_sensors(scenario: Scenario, phantom: Phantom, seeds: Seeds) -> dict[str, VirtualSensor]:
+    """Return the scenario's sensors along the needle, on a phantom that keeps its shapes, by name."""
+    own = np.random.SeedSequence(entropy=seeds.tracker.entropy, spawn_key=(*seeds.tracker.spawn_key, 0))
+    needle, axes, depth = scenario.needle, scenario.setup.axes, scenario.target.depth_mm
+    return {
+        one.title: VirtualSensor(one, phantom, axes, depth, needle.length_mm, np.random.default_rng(seed))
+        for one, seed in zip(scenario.sensor, own.spawn(len(scenario.sensor)), strict=True)
+    }
 
 
 def virtual_room(
@@ -161,12 +174,17 @@ def to_stage(registration: Registration | None) -> Rigid:
 
 
 def _noisy_tracker(
-    scenario: Scenario, phantom: Phantom, bias: Point, wrong: Rigid, rng: np.random.Generator
+    scenario: Scenario, phantom: Phantom, bias: Point, wrong: Rigid, rng: np.random.Generator, drift: Point
 ) -> NoisyTracker:
-    """Return the tracker with white noise, a bias (mm) and a wrong registration."""
+    """Return the tracker with white noise, a bias (mm), an error that grows to `drift` (mm) and a wrong registration."""
+
+    lost, depth = scenario.phantom.tracker_lost_mm, scenario.target.depth_mm
 
     def tip_at(time: float) -> Point:
         tip = phantom.tip_at(time)
+        if any(drift):
+            grown = max(0.0, tip[0]) / depth
+            tip = tip[0] + grown * drift[0], tip[1] + grown * drift[1], tip[2] + grown * drift[2]
         if scenario.tracker.registration is None:
             return tip
         x, y, z = wrong.apply(np.array(tip)).tolist()
@@ -191,6 +209,7 @@ def _noisy_tracker(
         axes=scenario.setup.axes,
         direction_at=None if jitter is None else direction_at,
         direction_jitter=jitter or 0.0,
+        lost_at=None if lost is None else lambda time: phantom.tip_at(time)[0] >= lost,
     )
 
 

@@ -39,6 +39,7 @@ class Truth:
         yield_mm: Lateral displacement (mm) from which the tissue tears, or None.
         spring_back: Length (mm) by which the base springs back where its advance stops in tissue.
         modulus_drift: Relative change of all moduli from the skin to the target.
+        drift: Error x, y, z (mm) of the tracker at the target's depth, which grows evenly from the skin.
     """
 
     scenario: Scenario
@@ -58,6 +59,7 @@ class Truth:
     yield_mm: float | None = None
     spring_back: float = 0.0
     modulus_drift: float = 0.0
+    drift: Point = (0.0, 0.0, 0.0)
 
     @property
     def layer_tops(self) -> tuple[float, ...]:
@@ -113,6 +115,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         yield_mm=settings.structure.yield_mm,
         spring_back=settings.structure.spring_back_mm,
         modulus_drift=settings.structure.modulus_drift,
+        drift=_drift(scenario, rng),
     )
 
 
@@ -125,6 +128,14 @@ def _bias(scenario: Scenario, angle: float, rng: np.random.Generator) -> Point:
     z = float(rng.uniform(-1.0, 1.0)) if scenario.setup.axes == 2 else 0.0
     flat = size * math.sqrt(1.0 - z**2)
     return flat * math.cos(angle), flat * math.sin(angle), size * z
+
+
+def _drift(scenario: Scenario, rng: np.random.Generator) -> Point:
+    """Draw the tracker's growing error (mm), across the needle."""
+    size, angle = scenario.phantom.tracker_drift_mm, float(rng.uniform(0.0, 2.0 * math.pi))
+    if scenario.setup.axes == 1:
+        return 0.0, math.copysign(size, math.cos(angle)), 0.0
+    return 0.0, size * math.cos(angle), size * math.sin(angle)
 
 
 def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:

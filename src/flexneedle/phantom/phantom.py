@@ -2,11 +2,13 @@
 
 import cmath
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from flexneedle.errors import InputError
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
 from flexneedle.phantom.spring_back import SpringBack
@@ -53,7 +55,9 @@ class Condition(NamedTuple):
 class Phantom:
     """The true needle. It moves on command; its clock advances by the duration of each command."""
 
-    def __init__(self, truth: Truth, roll: float, kind: str | PlantFactory = "exact") -> None:
+    def __init__(
+        self, truth: Truth, roll: float, kind: str | PlantFactory = "exact", *, keeps_shapes: bool = False
+    ) -> None:
         self._plant = make_plant(kind, truth, roll)
         self._truth = truth
         self._limits = Limits.of(truth.scenario)
@@ -63,6 +67,9 @@ class Phantom:
         self._time = 0.0
         self._least_stretch = 1.0
         self._path = [(0.0, *self._tip().tolist())]  # time and pose
+        self._keeps_shapes = keeps_shapes
+        self._shapes: list[tuple[float, float, Floats]] = []  # time, roll and poses
+        self._keep_shape(0.0)
 
     def condition(self) -> Condition:
         """Return the true state, for the record only; it is not available to controllers."""
@@ -81,6 +88,7 @@ class Phantom:
             self._step(np.array(STILL), self._time)
         self._time += seconds
         self._path.append((self._time, *self._tip().tolist()))
+        self._keep_shape(self._time)
 
     def apply(self, command: Control, duration: float) -> Motion:
         """Roll, then travel at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
@@ -121,6 +129,19 @@ class Phantom:
                 return Pose(*(p + part * (q - p) for p, q in zip(before, after, strict=True)))
         return Pose(*self._path[0][1:])
 
+    def shape_at(self, time: float) -> tuple[Floats, float]:
+        """Return the true poses (n, 5), at equal distances along the needle, and its roll (rad) at a time (s).
+
+        It must have been made with `keeps_shapes`.
+        """
+        k = bisect_right(self._shapes, time, key=lambda one: one[0])
+        if k in (0, len(self._shapes)):
+            _, roll, poses = self._shapes[min(k, len(self._shapes) - 1)]
+            return poses, roll
+        (t0, roll, poses), (t1, later, after) = self._shapes[k - 1 : k + 1]
+        part = (time - t0) / (t1 - t0) if t1 > t0 else 1.0
+        return poses + part * (after - poses), roll + part * (later - roll)
+
     def _roll(self, roll: float) -> float:
         """Roll with the base at rest; return the time (s) of the end. Between its ends the tip moves on an arc."""
         if roll == 0.0:
@@ -143,6 +164,16 @@ class Phantom:
             self._plant.step(part)
             self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
         self._path.append((time, *self._tip().tolist()))
+        self._keep_shape(time)
+
+    def _keep_shape(self, time: float) -> None:
+        if self._keeps_shapes:
+            nodes = getattr(self._plant, "nodes", None)
+            if nodes is None:
+                raise InputError(f"phantom = {type(self._plant).__name__}: without nodes no [[sensor]] can measure it")
+            before = self._shapes[-1][1] if self._shapes else self._plant.roll
+            turned = math.remainder(self._plant.roll - before, 2.0 * math.pi)
+            self._shapes.append((time, before + turned, to_poses(nodes)))
 
     def _round_to_steps(self, command: Control) -> Floats:
         """Return the command in whole motor steps, within the limits; the rotation of the base is not rounded."""
@@ -189,6 +220,14 @@ def of_arc(roll: float, part: float) -> complex:
     """Return the share of the chord, as a lateral quantity, at a part of an arc by `roll` (rad)."""
     whole = cmath.exp(1j * roll) - 1.0
     return (cmath.exp(1j * roll * part) - 1.0) / whole if abs(whole) > _WHOLE else complex(part)
+
+
+def to_poses(nodes: Floats) -> Floats:
+    """Return the poses (n, 5) of nodes (n, 3): the slope at a node is the mean of the chords beside it."""
+    chords = np.diff(nodes, axis=0)
+    slopes = chords[:, Y:] / chords[:, :Y]
+    inner = 0.5 * (slopes[1:] + slopes[:-1])
+    return np.concatenate([nodes, np.concatenate([slopes[:1], inner, slopes[-1:]])], axis=1)
 
 
 def evenly_spaced(nodes: Floats, count: int) -> Floats:

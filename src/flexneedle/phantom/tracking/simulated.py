@@ -24,6 +24,7 @@ class NoisyTracker:
         axes: Lateral axes.
         direction_at: Returns the slopes θ, ψ of the tip (rad) at a time (default: not measured).
         direction_jitter: Standard deviation of the noise of the slopes (rad).
+        lost_at: Returns True for a time from which the tip is not measured any more (default: never).
     """
 
     def __init__(
@@ -40,7 +41,9 @@ class NoisyTracker:
         axes: int = 1,
         direction_at: Callable[[float], Sequence[float]] | None = None,
         direction_jitter: float = 0.0,
+        lost_at: Callable[[float], bool] | None = None,
     ) -> None:
+        self._lost_at = lost_at
         self._tip_at, self._clock = tip_at, clock
         self._period, self._jitter = period, jitter
         # Readings before the start have their own generator, so that the delay does not change the noise of later ones.
@@ -68,7 +71,8 @@ class NoisyTracker:
         x, y, z = self._tip_at(time)
         rng = self._rng_first if is_first else self._rng if time > 0.0 else self._rng_before
         noise = rng.normal(0.0, self._jitter, 1 + self._axes).tolist()
-        if rng.random() < self._missing and not is_first:
+        missing = rng.random() < self._missing and not is_first
+        if missing or (self._lost_at is not None and self._lost_at(time)):
             return Measurement(time, None, None)
         tip = x + self._bias[0] + noise[0], y + self._bias[1] + noise[1]
         return Measurement(

@@ -226,6 +226,14 @@ class TrackerSettings(Section):
     """Readings per second."""
     jitter_mm: NonNegative = 0.07
     """RMS length of the 3D deviation of a reading from the mean. `environment` replaces it."""
+    enabled: bool = True
+    """Whether there is a tracker. Without one the scenario needs a `[[sensor]]`, and the depth is the motors'."""
+    bias_sd_mm: NonNegative = 0.0
+    """Prior standard deviation, on each axis, of a constant error of the tracker, which `adaptive-mpc` then estimates."""
+    field_sd_mm: NonNegative = 0.0
+    """Standard deviation, on each axis, of an error of the tracker that is correlated along the path of the tip."""
+    field_length_mm: Positive = 40.0
+    """Length over which this error is correlated."""
     direction_jitter_mrad: Positive | None = None
     """Standard deviation of a coordinate of the measured direction. Not set: directions are not used."""
     tip_offset_mm: NonNegative = 0.0

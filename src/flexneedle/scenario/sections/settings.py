@@ -7,6 +7,7 @@ from pydantic import ConfigDict, Field, model_validator
 from flexneedle.costs.terms import PLAN
 from flexneedle.scenario.problems import Problem, refuse, unknown_key
 from flexneedle.scenario.sections.fields import (
+    LARGEST,
     Fraction,
     NonNegative,
     NonNegativeRange,
@@ -111,6 +112,9 @@ class ControlSettings(Section):
     """Largest predicted lateral miss at the target. The needle is held if no better path is found."""
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
     """Probability of a miss beyond `miss_limit_mm` from which the needle is held."""
+    tip_sd_limit_mm: Positive | None = None
+    """Standard deviation of the estimated tip across the needle from which it is held, with a `[[sensor]]`. Not set: half
+    of `miss_limit_mm`."""
     hold_limit_s: Positive = 1.0
     """Time without a valid reading, or without a path to the target, after which the insertion ends."""
     hold_total_s: Positive = 300.0
@@ -138,6 +142,11 @@ class ControlSettings(Section):
     def tables(self) -> dict[str, Any]:
         """The controllers' tables by name, plain values."""
         return dict(self.model_extra or {})
+
+    @property
+    def tip_sd_limit(self) -> float:
+        """Largest standard deviation of the estimated tip, mm."""
+        return 0.5 * self.miss_limit_mm if self.tip_sd_limit_mm is None else self.tip_sd_limit_mm
 
     @property
     def start_angle_sd(self) -> float:
@@ -197,6 +206,10 @@ class PhantomSettings(Section):
     """Share of readings without a tip position."""
     tracker_bias_mm: NonNegative = 0.0
     """Constant error of the tracker; its direction is drawn."""
+    tracker_drift_mm: NonNegative = 0.0
+    """Error of the tracker that grows evenly from the skin to the target's depth; its lateral direction is drawn."""
+    tracker_lost_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None = None
+    """Depth from which the tracker measures no tip. Not set: none."""
     contact_spacing_mm: Positive = 0.5
     """Spacing of contact points along the channel."""
     element_mm: Positive = 0.5

@@ -6,8 +6,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flexneedle.scenario.sections.fields import NonNegative, Positive
-from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors, perturbed, rotate
-from flexneedle.types import Needles
+from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors, perturbed
+from flexneedle.types import THETA, Needles, Y
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -25,7 +25,7 @@ class FbgErrors(SensorErrors):
     site_mm: NonNegative = 1.0
     """Largest displacement of each site along the needle."""
     temperature_per_m: NonNegative = 0.02
-    """Error of all curvatures from the start to the end of an insertion, by what is left of the temperature."""
+    """Standard deviation of an error of all sites that grows to the target's depth: what is left of the temperature."""
 
 
 class Fbg(Sensor):
@@ -78,13 +78,17 @@ class Fbg(Sensor):
         """Return the number of curvatures."""
         return axes * len(self.sites_mm)
 
+    @property
+    def rolls(self) -> bool:
+        """True: it rolls with the needle."""
+        return True
+
     def predict(self, needles: Needles, axes: int) -> "Floats":
-        """Return the mean curvatures (m, d), 1/mm, over the gauges, in the frame that rolls with the needle."""
-        half = 0.5 * self.gauge_mm
-        ends = [tilts_at(needles, np.maximum(0.0, np.array(self.sites_mm) + off)) for off in (half, -half)]
-        length = np.array(self.sites_mm) + half - np.maximum(0.0, np.array(self.sites_mm) - half)
-        bent = (ends[1] - ends[0])[..., :axes] / length[:, None]
-        return rotate(bent.reshape(len(bent), -1), -needles.roll, axes)
+        """Return the mean curvatures (m, d), 1/mm, over the gauges."""
+        far = np.array(self.sites_mm) + 0.5 * self.gauge_mm
+        near = np.maximum(0.0, far - self.gauge_mm)  # the tip ends the last gauge
+        bent = (tilts_at(needles, near) - tilts_at(needles, far))[..., :axes] / (far - near)[:, None]
+        return bent.reshape(len(bent), -1)
 
     def model_error(self, planned: "Floats") -> "Floats":
         """Return standard deviations (d,), 1/mm: a constant, and a share of the curvature along the plan."""
@@ -95,23 +99,25 @@ class Fbg(Sensor):
         most = min(self.phantom.site_mm, 0.4 * min(np.diff(self.sites_mm, prepend=0.0)))
         return self.model_copy(update={"sites_mm": tuple(perturbed(self.sites_mm, most, rng))})
 
-    def drifts(self, rng: np.random.Generator, axes: int) -> "Floats":
-        """Return the error (d,), 1/mm, at the end of an insertion by the temperature."""
+    def drawn_drift(self, rng: np.random.Generator, axes: int) -> "Floats":
+        """Return the error (d,), 1/mm, that grows to the target's depth: of the temperature, the same at all sites."""
         drift: Any = rng.normal(0.0, _PER_M * self.phantom.temperature_per_m, axes)
         return np.tile(drift, len(self.sites_mm))
 
 
 def tilts_at(needles: Needles, distances: "Floats") -> "Floats":
-    """Return tilts (m, k, 2) at distances (k,), mm, from the tip: the slope of the cubic between two nodes."""
-    points, tilts = needles.points, needles.tilts
-    last = points.shape[1] - 1
+    """Return the angles (m, k, 2) of the axis from x at distances (k,), mm, from the tip, in the directions y and z.
+
+    Between two nodes the slope is the quadratic with the nodes' slopes and the chord between them, as of a cubic.
+    """
+    poses, last = needles.poses, needles.poses.shape[1] - 1
     place = np.clip(last - distances / needles.spacing, 0.0, last - 1e-9)
     left = place.astype(int)
     r = (place - left)[:, None]
-    before, after = tilts[:, left], tilts[:, left + 1]
-    step = points[:, left + 1] - points[:, left]
-    chord = np.hypot(step[..., 1], step[..., 2])
-    tilt = np.arctan2(chord, step[..., 0]) / np.where(chord > 0.0, chord, 1.0)
-    mean = tilt[..., None] * step[..., 1:]
-    # The quadratic with these ends and this mean.
-    return before * (1.0 - r) + after * r + 6.0 * r * (1.0 - r) * (mean - 0.5 * (before + after))
+    before, after = poses[:, left], poses[:, left + 1]
+    step = (after - before)[..., :THETA]
+    ends = before[..., THETA:] * (1.0 - r) + after[..., THETA:] * r
+    middle = 0.5 * (before + after)[..., THETA:]
+    slope = ends + 6.0 * r * (1.0 - r) * (step[..., Y:] / step[..., :Y] - middle)
+    steep = np.hypot(slope[..., :1], slope[..., 1:])
+    return slope * np.divide(np.arctan(steep), steep, out=np.ones_like(steep), where=steep > 0.0)

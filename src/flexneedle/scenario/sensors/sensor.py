@@ -2,10 +2,11 @@
 
 A kind says what an error-free sensor measures on a needle, and how large the errors are. A reading is
 
-    (1 + g) e^(iρ) q + o + w + ε
+    (1 + g) e^(i(ρ − φ)) q + o + w + ε
 
-with the quantity q of the needle, gain error g, turn ρ, offset o, wander w (correlated over time) and white noise ε.
-Units of values are those that the kind chooses, the same in all of its methods.
+with the quantity q of the needle, gain error g, turn ρ, offset o, wander w (correlated over time) and white noise ε; φ is
+the angle of the needle for a sensor that rolls with it, else 0. Units of values are those that the kind chooses, the
+same in all of its methods.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,16 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
-FAULTS = ("none", "lost", "frozen", "drift", "outliers", "delayed")
+class Fault(Section):
+    """Table `phantom.fault` of a `[[sensor]]`: a fault of the virtual sensor."""
+
+    kind: Literal["lost", "frozen", "drift", "outliers", "delayed"]
+    """`lost`: no more readings; `frozen`: all repeat the last; `drift`, `outliers`, `delayed`: see `size`."""
+    depth_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] = 0.0
+    """Depth of the tip at which it begins."""
+    size: NonNegative = 1.0
+    """Growth of the error of all values per mm of depth, over the noise (`drift`), share of readings (`outliers`), or
+    further delay in s (`delayed`)."""
 
 
 class SensorErrors(Section):
@@ -40,13 +50,8 @@ class SensorErrors(Section):
     """Share of readings whose error is `outlier_size` times the noise."""
     outlier_size: NonNegative = 20.0
     """Error of an outlier, over the noise."""
-    fault: Literal["none", "lost", "frozen", "drift", "outliers", "delayed"] = "none"
-    """Fault that begins at `fault_depth_mm` and lasts."""
-    fault_depth_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] = 0.0
-    """Depth of the tip at which the fault begins."""
-    fault_size: NonNegative = 1.0
-    """Size of the fault: growth of the error per mm of depth, over the noise (`drift`); share of readings (`outliers`);
-    time in s (`delayed`)."""
+    fault: Fault | None = None
+    """Not set: none."""
 
 
 class Sensor(Section):
@@ -103,12 +108,20 @@ class Sensor(Section):
         """True if values in space are pairs of lateral components, y and z."""
         return True
 
+    @property
+    def rolls(self) -> bool:
+        """True if the sensor is in the needle and rolls with it; its values are pairs."""
+        return False
+
     def size(self, axes: int) -> int:
         """Return the number of values d of a needle with 1 or 2 lateral axes."""
         raise NotImplementedError
 
     def predict(self, needles: Needles, axes: int) -> "Floats":
-        """Return the values (m, d) of an error-free sensor on needles; finite, beyond the tip, too."""
+        """Return the values (m, d) of an error-free sensor on needles, finite, beyond the tip, too.
+
+        For a sensor that rolls with the needle, as if it did not.
+        """
         raise NotImplementedError
 
     def sees(self, needles: Needles, axes: int) -> "Flags":
@@ -134,6 +147,11 @@ class Sensor(Section):
         """Return the sensor where it really is, drawn from `phantom`."""
         return self
 
+    def drawn_drift(self, rng: np.random.Generator, axes: int) -> "Floats":
+        """Return the error (d,) of the virtual sensor that grows evenly from the start to the target's depth."""
+        del rng
+        return np.zeros(self.size(axes))
+
     def drawn_offset(self, rng: np.random.Generator, axes: int) -> "Floats":
         """Return the offset (d,) of the virtual sensor."""
         return rng.normal(0.0, self.offset_sd, self.size(axes))
@@ -151,17 +169,12 @@ def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
     return values
 
 
-def rotate(values: "Floats", angle: Any, axes: int) -> "Floats":
-    """Return pairs (m, d) turned by angles (m,) or (); in the plane the cosine counts."""
+def turn(values: "Floats", facing: Any, axes: int) -> "Floats":
+    """Return values (m, d), lateral pairs in space, turned by unit numbers (m,) or (): by their cosine in the plane."""
     if axes == 1:
-        return values * np.cos(angle)[..., None]
-    pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.exp(1j * np.asarray(angle))[..., None]
-    return interleave(pairs)
-
-
-def interleave(pairs: "NDArray[Any]") -> "Floats":
-    """Return the components (m, 2 n) of lateral quantities y + iz (m, n)."""
-    return np.stack([pairs.real, pairs.imag], axis=-1).reshape(len(pairs), -1)
+        return values * np.asarray(facing).real[..., None]
+    pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.asarray(facing)[..., None]
+    return np.stack([pairs.real, pairs.imag], axis=-1).reshape(values.shape)
 
 
 def perturbed(values: Sequence[float], most: float, rng: np.random.Generator) -> list[float]:

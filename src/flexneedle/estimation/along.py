@@ -1,0 +1,253 @@
+"""Sensors along the needle in the fit: their readings, predictions and derivatives, as real rows.
+
+Readings are averaged over each move. Values of a sensor that rolls with the needle are turned back to the stage's axes
+before, each by the needle's angle at its time, so that the quantity of the model is smooth over the depth; then the
+offset turns instead.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.estimation.moves import Move
+from flexneedle.scenario.sensors.sensor import Sensor, turn
+from flexneedle.types import Flags, Floats, Needles
+
+_ROUNDING_S = 1e-9
+
+
+class SensorSlots(NamedTuple):
+    """Places of a sensor's parameters: offset (d), and gain error, turn (rad) and clock error (s) where they exist."""
+
+    offset: slice
+    gain: int | None
+    turn: int | None
+    clock: int | None
+
+
+class Timeline(NamedTuple):
+    """Times (m,), s, of moves, and the needle's angle (rad): at their start, and its change (m,)."""
+
+    begun: Floats
+    travel_begun: Floats
+    ended: Floats
+    angle: Floats
+    turned: Floats
+
+    @staticmethod
+    def of(moves: Sequence[Move], roll: float) -> "Timeline":
+        """Return the timeline of moves from a needle's angle."""
+        rows = np.array(
+            [
+                (one.begun, one.travel_begun, one.ended, one.control.roll, one.control.spin)
+                for one in (done.motion for done in moves)
+            ]
+        ).reshape(-1, 5)
+        turned = rows[:, 3] + rows[:, 4]
+        return Timeline(*rows[:, :3].T, roll + np.cumsum(turned) - turned, turned)
+
+    def at(self, times: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
+        """Return move, share of it done, and angle of the needle (r,), at times (r,)."""
+        index = np.searchsorted(self.begun[1:], times - _ROUNDING_S, side="left")
+        begun, ended = self.travel_begun[index], self.ended[index]
+        length = np.where(ended > begun, ended - begun, 1.0)
+        part = np.where(ended > begun, np.clip((times - begun) / length, 0.0, 1.0), 1.0)
+        return index, part, self.angle[index] + part * self.turned[index]
+
+
+class Bins(NamedTuple):
+    """Means of readings over b moves, in the stage's axes."""
+
+    index: NDArray[np.intp]  # moves (b,)
+    part: Floats  # share of the move that is done (b,)
+    value: Floats  # (b, d), 0 where nothing was measured
+    count: Floats  # readings (b, d)
+    facing: NDArray[Any]  # mean direction (b,) of the sensor's axes, 1 for one that does not roll
+    time: Floats  # (b,), s
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Readings (r,) of a sensor beside their predictions."""
+
+    value: Floats  # (r, d), NaN where nothing was measured
+    residual: Floats  # value minus prediction (r, d)
+    covariance: Floats  # of the prediction (d, d), with the model's error
+    noise: float  # standard deviation of the white noise of a value
+
+    @property
+    def sds(self) -> Floats:
+        """Residuals (r, d) over the standard deviation of each."""
+        sds: Floats = self.residual / np.sqrt(np.diag(self.covariance) + self.noise**2)
+        return sds
+
+    def nis(self, good: Flags) -> float:
+        """Return the normalised square of the mean residual of good readings (r,), 1 on average; NaN without any."""
+        kept = self.residual[good]
+        count = np.isfinite(kept).sum(axis=0)
+        seen = count > 0
+        if not seen.any():
+            return np.nan
+        mean = np.nansum(kept, axis=0)[seen] / count[seen]
+        covariance = self.covariance[np.ix_(seen, seen)] + np.diag(self.noise**2 / count[seen])
+        return float(mean @ np.linalg.solve(covariance, mean)) / mean.size
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFit:
+    """A sensor in the fit, and its readings so far."""
+
+    sensor: Sensor
+    slots: SensorSlots
+    axes: int
+    model_sd: Floats  # model error (d,) of the mean of a move
+    time: Floats  # (r,), s
+    value: Floats  # (r, d), NaN where nothing was measured
+    used: Flags  # readings (r,) that correct the model
+
+    @property
+    def name(self) -> str:
+        """Name of the sensor."""
+        return self.sensor.title
+
+    def add(self, time: Floats, value: Floats) -> "SensorFit":
+        """Return the sensor with further readings (n,) and (n, d)."""
+        return replace(
+            self,
+            time=np.append(self.time, time),
+            value=np.concatenate([self.value, value]),
+            used=np.append(self.used, np.ones(len(time), dtype=bool)),
+        )
+
+    def without(self, since: float) -> "SensorFit":
+        """Return the sensor whose readings from a time (s) on do not count."""
+        return replace(self, used=self.used & (self.time < since))
+
+    def parameter(self, parameters: Floats, name: str) -> float:
+        """Return gain error, turn or clock error of parameters (K,); 0 where it is not estimated."""
+        place = getattr(self.slots, name)
+        return 0.0 if place is None else float(parameters[place])
+
+    @cached_property
+    def _known(self) -> tuple[Floats, Floats]:
+        return self.time[self.used], self.value[self.used]
+
+    def bins(self, line: Timeline, clock: float) -> Bins:
+        """Return the means over moves of the readings that count, which were taken `clock` (s) before their time."""
+        time, value = self._known
+        index, part, angle = line.at(time - clock)
+        order = np.argsort(index, kind="stable")
+        index, part, value, time = index[order], part[order], value[order], time[order]
+        facing = np.exp(1j * angle[order]) if self.sensor.rolls else np.ones(len(index), dtype=complex)
+        first = np.flatnonzero(np.diff(index, prepend=-1))
+        seen = np.isfinite(value)
+
+        def total(rows: NDArray[Any]) -> NDArray[Any]:
+            return np.add.reduceat(rows, first) if len(first) else rows
+
+        if self.sensor.rolls and self.axes == 1:  # between half turns it leaves the plane
+            seen &= line.turned[index][:, None] == 0.0
+        number, count = total(np.ones(len(index))), total(seen.astype(float))
+        level = np.where(seen, value, 0.0)
+        mean = total(self._turned(level, facing)) / np.maximum(count, 1.0)
+        return Bins(index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number)
+
+    def quantities(self, poses: Floats, length: float) -> Floats:
+        """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm)."""
+        flat = poses.reshape(-1, *poses.shape[-2:])
+        found = self.sensor.predict(Needles(flat, length / (flat.shape[1] - 1)), self.axes)
+        return found.reshape(*poses.shape[:-2], -1)
+
+    def predict_at(self, time: Floats, ends: Floats, line: Timeline, parameters: Floats) -> Floats:
+        """Return the predicted values (r, d) at times (r,), from quantities (m + 1, d) at the ends of the moves."""
+        index, part, angle = line.at(time - self.parameter(parameters, "clock"))
+        level = (1.0 - part)[:, None] * ends[index] + part[:, None] * ends[index + 1]
+        return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + parameters[self.slots.offset]
+
+    def bin_at(self, time: Floats, line: Timeline) -> Bins:
+        """Return bins (b,) of one reading each, at times (b,)."""
+        index, part, angle = line.at(time)
+        none = np.zeros((len(time), len(self.model_sd)))
+        facing = np.exp(1j * angle) if self.sensor.rolls else np.ones(len(time), dtype=complex)
+        return Bins(index, part, none, none, facing, time)
+
+    def variances(self, bins: Bins) -> Floats:
+        """Return the variances (b, d) of means, infinite where nothing was measured."""
+        noise = self.sensor.noise**2 / np.maximum(bins.count, 1.0) + self.model_sd**2
+        return np.where(bins.count > 0.0, noise, np.inf)
+
+    def expected(self, bins: Bins, ends: Floats, parameters: Floats) -> Floats:
+        """Return the predicted means (b, d), of quantities (m + 1, d) at the ends of the moves."""
+        level = self._with_gain(between(bins, ends), parameters)
+        return level + self._turned(np.broadcast_to(parameters[self.slots.offset], level.shape), bins.facing)
+
+    def _turned(self, value: Floats, facing: Any) -> Floats:
+        """Return values (r, d) of a sensor that rolls in the stage's axes, others as they are."""
+        return turn(value, facing, self.axes) if self.sensor.rolls else value
+
+    def _with_gain(self, level: Floats, parameters: Floats) -> Floats:
+        scaled = (1.0 + self.parameter(parameters, "gain")) * level
+        if self.slots.turn is None:
+            return scaled
+        return turn(scaled, np.exp(1j * parameters[self.slots.turn]), self.axes)
+
+    def jacobian(
+        self, bins: Bins, ends: Floats, slopes: Floats, parameters: Floats, line: Timeline
+    ) -> Floats:
+        """Return derivatives (b, d, K) of the predicted means, from those (b, K, d) of the quantities."""
+        level = between(bins, ends)
+        jacobian = (1.0 + self.parameter(parameters, "gain")) * slopes.transpose(0, 2, 1)
+        size = level.shape[1]
+        offset = np.zeros((len(level), size, size))
+        units = np.eye(size)
+        for k in range(size):
+            offset[:, :, k] = self._turned(np.broadcast_to(units[k], level.shape), bins.facing)
+        jacobian[:, :, self.slots.offset] = offset
+        if self.slots.gain is not None:
+            jacobian[:, :, self.slots.gain] = level
+        if self.slots.turn is not None:
+            jacobian[:, :, self.slots.turn] = turn(level, np.array(1j), self.axes)
+        if self.slots.clock is not None:
+            jacobian[:, :, self.slots.clock] = self._rates(bins, level, ends, line)
+        return jacobian
+
+    def _rates(self, bins: Bins, level: Floats, ends: Floats, line: Timeline) -> Floats:
+        """Return the derivatives (b, d) of predicted minus measured means to the clock error (s)."""
+        length = (line.ended - line.travel_begun)[bins.index]
+        moving = (length > 0.0) & (bins.part < 1.0)
+        rate = np.where(moving, 1.0, 0.0) / np.where(length > 0.0, length, 1.0)
+        change = -(ends[bins.index + 1] - ends[bins.index]) * rate[:, None]
+        if self.sensor.rolls and self.axes == 2:
+            return change + turn(level, 1j * line.turned[bins.index] * rate, self.axes)
+        return change
+
+
+def between(bins: Bins, ends: Floats) -> Floats:
+    """Return quantities (b, d) of means, from those (m + 1, d) at the ends of the moves."""
+    part = bins.part[:, None]
+    level: Floats = (1.0 - part) * ends[bins.index] + part * ends[bins.index + 1]
+    return level
+
+
+def whiten(rows: Sequence[NDArray[Any]], variance: Floats, sd: float, distance: Floats) -> list[NDArray[Any]]:
+    """Return arrays (b, …) with the noise of their rows made white, of variance 1.
+
+    Its covariance is `variance` (b,) on the diagonal and sd² e^(−|d_i − d_j|) elsewhere and on it; distance (b,) is over
+    the correlation's. Rows without a finite variance become 0.
+    """
+    known = np.isfinite(variance)
+    if sd == 0.0:
+        scale = np.where(known, 1.0 / np.sqrt(np.where(known, variance, 1.0)), 0.0)
+        return [(one.T * scale).T for one in rows]
+    off = np.abs(distance[known, None] - distance[known])
+    lower = np.linalg.cholesky(np.diag(variance[known]) + sd**2 * np.exp(-off))
+    found = []
+    for one in rows:
+        white = np.zeros_like(one)
+        white[known] = np.linalg.solve(lower, one[known])
+        found.append(white)
+    return found

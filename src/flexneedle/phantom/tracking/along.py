@@ -1,0 +1,101 @@
+"""Virtual sensors along the needle, on the true needle, with errors that the observer does not know."""
+
+import math
+
+import numpy as np
+
+from flexneedle.phantom.phantom import Phantom
+from flexneedle.scenario.sensors.sensor import Fault, Sensor, turn
+from flexneedle.types import VISIBLE, Floats, Needles, Reading, X
+
+
+class VirtualSensor:
+    """A `NeedleSensor` that measures the phantom.
+
+    Args:
+        sensor: The sensor as the scenario describes it.
+        phantom: The phantom, which must keep its shapes.
+        axes: Lateral axes.
+        depth: Depth (mm) of the target, at which a drift is complete.
+        length: Length of the needle (mm).
+        rng: Random numbers.
+    """
+
+    def __init__(
+        self, sensor: Sensor, phantom: Phantom, axes: int, depth: float, length: float, rng: np.random.Generator
+    ) -> None:
+        # Each quantity has its own generator, so that a change of one does not change the others.
+        places, errors, self._rng, faults = rng.spawn(4)
+        self._sensor, self._phantom, self._axes, self._depth, self._length = sensor, phantom, axes, depth, length
+        self._mounted = sensor.mounted(places)
+        self._gain = 1.0 + errors.normal(0.0, sensor.gain_sd)
+        self._turn = errors.normal(0.0, math.radians(sensor.turn_sd_deg))
+        self._offset = sensor.drawn_offset(errors, axes)
+        self._drift = sensor.drawn_drift(errors, axes)
+        self._clock = errors.uniform(-1.0, 1.0) * sensor.phantom.clock_s
+        self._faulty_way = faults.choice([-1.0, 1.0], axes if sensor.paired else 1)
+        self._wander = errors.normal(0.0, 1.0, self._offset.size)
+        self._taken, self._last = -1, None
+        self._lost = False
+
+    @property
+    def status(self) -> str:
+        """VISIBLE, or that it is lost."""
+        return "no more readings" if self._lost else VISIBLE
+
+    def read(self) -> tuple[Reading, ...]:
+        """Return the readings that arrived since the last call, oldest first."""
+        period, now = 1.0 / self._sensor.rate_hz, self._phantom.now()
+        found = []
+        while True:
+            time = (self._taken + 1) * period
+            fault = self._fault_at(time)
+            late = fault.size if fault and fault.kind == "delayed" else 0.0
+            if time + self._sensor.delay_s + late > now + 1e-9:
+                return tuple(found)
+            self._taken += 1
+            self._lost = fault is not None and fault.kind == "lost"
+            if not self._lost:
+                found.append(self._measure(time, fault, time + self._clock + late))
+
+    def _fault_at(self, time: float) -> Fault | None:
+        """Return the fault, if it has begun."""
+        fault = self._sensor.phantom.fault
+        begun = fault is not None and self._phantom.tip_at(time)[X] >= fault.depth_mm
+        return fault if begun else None
+
+    def _measure(self, time: float, fault: Fault | None, stamp: float) -> Reading:
+        errors, sensor = self._sensor.phantom, self._sensor
+        noise = self._rng.normal(0.0, sensor.noise, self._offset.size)
+        chance, outlying, side = self._rng.random(3).tolist()
+        self._step_wander()
+        if fault and fault.kind == "frozen" and self._last is not None:
+            return Reading(stamp, self._last)
+        if chance < errors.missing_fraction:
+            return Reading(stamp, (), "missing")
+        values = self._values(time) + noise + sensor.wander_sd * self._wander
+        if fault and fault.kind == "drift":
+            gone = self._phantom.tip_at(time)[X] - fault.depth_mm
+            values += fault.size * sensor.noise * gone * np.tile(self._faulty_way, values.size)[: values.size]
+        share = fault.size if fault and fault.kind == "outliers" else errors.outlier_fraction
+        if outlying < share:
+            values += math.copysign(errors.outlier_size * sensor.noise, side - 0.5)
+        self._last = sensor.report(values, self._axes)
+        return Reading(stamp, self._last)
+
+    def _step_wander(self) -> None:
+        kept = math.exp(-1.0 / (self._sensor.rate_hz * self._sensor.wander_s))
+        fresh = self._rng.normal(0.0, math.sqrt(1.0 - kept**2), self._wander.size)
+        self._wander = kept * self._wander + fresh
+
+    def _values(self, time: float) -> Floats:
+        """Return the values (d,) at a time without noise, NaN where the sensor does not see the needle."""
+        poses, roll = self._phantom.shape_at(time)
+        needle = Needles(poses[None], self._length / (len(poses) - 1))
+        seen = self._mounted.sees(needle, self._axes)[0]
+        level = self._gain * self._mounted.predict(needle, self._axes)
+        angle = self._turn - (roll if self._sensor.rolls else 0.0)
+        if angle and self._sensor.paired:
+            level = turn(level, np.exp(1j * angle), self._axes)
+        grown = max(0.0, poses[-1, X]) / self._depth * self._drift
+        return np.where(seen, level[0] + self._offset + grown, np.nan)
