@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
+
 class Fault(Section):
     """Table `phantom.fault` of a `[[sensor]]`: a fault of the virtual sensor."""
 

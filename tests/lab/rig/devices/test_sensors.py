@@ -55,6 +55,10 @@ def table(name="fbg", **settings):
     return {"name": name, "kind": "own:Gratings", **settings}
 
 
+def parts(*tables):
+    return rig(sensor=list(tables)).sensor
+
+
 def scenario(*sensors):
     tables = [one.model_dump(exclude_none=True) for one in sensors]
     return load_scenario("phantom").with_values({"monitor.references": 0, "sensor": tables})
@@ -62,7 +66,7 @@ def scenario(*sensors):
 
 def test_each_sensor_gets_its_settings_the_clock_and_the_scenarios_sensor():
     clock = ManualClock()
-    with open_sensors(rig(sensor=[table(gain=2.0), table("back")]), (BACK, FBG), clock) as found:
+    with open_sensors(parts(table(gain=2.0), table("back")), (BACK, FBG), clock) as found:
         assert list(found) == ["fbg", "back"]
         first, second = Gratings.opened
         assert (first.settings, first.clock, first.sensor, second.sensor) == ({"gain": 2.0}, clock, FBG, BACK)
@@ -74,7 +78,7 @@ def test_each_sensor_gets_its_settings_the_clock_and_the_scenarios_sensor():
 def test_a_sensor_that_fails_to_open_closes_the_others():
     with (
         pytest.raises(DriverError, match="sensor back own:Gratings: RuntimeError: no light"),
-        open_sensors(rig(sensor=[table(), table("back", fails=True)]), (FBG, BACK), ManualClock()),
+        open_sensors(parts(table(), table("back", fails=True)), (FBG, BACK), ManualClock()),
     ):
         pass
     assert [one.closed for one in Gratings.opened] == [True]
@@ -82,7 +86,7 @@ def test_a_sensor_that_fails_to_open_closes_the_others():
 
 @pytest.mark.parametrize(("result", "rule"), [([1], "one is an? int"), ("no", "not a str")])
 def test_a_result_of_a_wrong_type_is_an_error_of_the_driver(result, rule):
-    with open_sensors(rig(sensor=[table()]), (FBG,), ManualClock()) as found:
+    with open_sensors(parts(table()), (FBG,), ManualClock()) as found:
         Gratings.opened[0].result = result
         with pytest.raises(DriverError, match=rf"Gratings.read\(\): must be a tuple of Reading, .*{rule}"):
             found["fbg"].read()
@@ -91,7 +95,7 @@ def test_a_result_of_a_wrong_type_is_an_error_of_the_driver(result, rule):
 def test_an_unknown_kind_is_refused():
     with (
         pytest.raises(RigError, match=r'^sensor fbg.kind = "own:None_": own has no None_'),
-        open_sensors(rig(sensor=[{"name": "fbg", "kind": "own:None_"}]), (FBG,), ManualClock()),
+        open_sensors(parts({"name": "fbg", "kind": "own:None_"}), (FBG,), ManualClock()),
     ):
         pass
 
@@ -124,7 +128,7 @@ def test_rig_check_reads_the_sensors_of_the_scenario():
     lines = {one.item: (one.found, one.problem) for one in found if one.part == "sensor fbg"}
     assert lines == {
         "connection": ("own:Gratings", ""),
-        "readings": ("50.0 Hz", ""),
+        "readings": ("49.0 Hz", ""),
         "status": ("ok", ""),
         "values": ("0.001, 0.002; 0.001, 0.002", ""),
     }

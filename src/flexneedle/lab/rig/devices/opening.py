@@ -130,12 +130,12 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
 
 @contextmanager
 def open_sensors(
-    rig: RigFile, sensors: Sequence[Sensor], clock: Clock
+    parts: Sequence[SensorSection], sensors: Sequence[Sensor], clock: Clock
 ) -> Iterator[dict[str, OpenNeedleSensor]]:
-    """Open the sensors along the needle of a rig, and yield them by name.
+    """Open sensors along the needle, and yield them by name.
 
     Args:
-        rig: The rig file.
+        parts: Sensors of a rig file.
         sensors: Sensors of the scenario, one for each of the rig file (`fit_problems`).
         clock: The clock of the run, on which readings have their times.
 
@@ -145,8 +145,7 @@ def open_sensors(
     wanted = {one.title: one for one in sensors}
     with ExitStack() as stack:
         yield {
-            part.name: stack.enter_context(closing(open_sensor(part, wanted[part.name], clock)))
-            for part in rig.sensor
+            one.name: stack.enter_context(closing(open_sensor(one, wanted[one.name], clock))) for one in parts
         }
 
 
