@@ -154,9 +154,7 @@ class SensorFit:
         number, count = total(np.ones(len(index))), total(seen.astype(float))
         level = np.where(seen, value, 0.0)
         mean = total(self._turned(level, facing)) / np.maximum(count, 1.0)
-        return Bins(
-            index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number
-        )
+        return Bins(index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number)
 
     def quantities(self, poses: Floats, length: float) -> Floats:
         """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm)."""
@@ -168,10 +166,7 @@ class SensorFit:
         """Return the predicted values (r, d) at times (r,), from quantities (m + 1, d) at the ends of the moves."""
         index, part, angle = line.at(time - self.parameter(parameters, "clock"))
         level = (1.0 - part)[:, None] * ends[index] + part[:, None] * ends[index + 1]
-        return (
-            self._turned(self._with_gain(level, parameters), np.exp(-1j * angle))
-            + parameters[self.slots.offset]
-        )
+        return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + parameters[self.slots.offset]
 
     def bin_at(self, time: Floats, line: Timeline) -> Bins:
         """Return bins (b,) of one reading each, at times (b,)."""

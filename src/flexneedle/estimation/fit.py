@@ -39,11 +39,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
     whitening = Whitening.of(fitted, variance)
     if whitening:
-        jacobian, left, variance = (
-            whitening.of_rows(jacobian),
-            whitening.of_rows(left),
-            np.ones_like(variance),
-        )
+        jacobian, left, variance = whitening.of_rows(jacobian), whitening.of_rows(left), np.ones_like(variance)
     weighted = jacobian.conj().T / variance
     gradient = (weighted @ left).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
@@ -164,12 +160,7 @@ def _whitened(one: SensorFit, bins: Bins, *arrays: Floats) -> Iterator[list[Floa
     variances = one.variances(bins)
     wander, distance = one.sensor.wander_sd, bins.time / one.sensor.wander_s
     if wander == 0.0:
-        yield whiten(
-            [each.reshape(variances.size, *each.shape[2:]) for each in arrays],
-            variances.ravel(),
-            0.0,
-            distance,
-        )
+        yield whiten([each.reshape(variances.size, *each.shape[2:]) for each in arrays], variances.ravel(), 0.0, distance)
         return
     for k, variance in enumerate(variances.T):
         yield whiten([each[:, k] for each in arrays], variance, wander, distance)
@@ -218,13 +209,7 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
     if fitted.along and needles.begun:
         whole = fitted.quantities_of(np.concatenate([shapes, further.shapes], axis=1))
         along_curves = tuple(
-            _renew(
-                old,
-                needles.begun,
-                (each[1:] - each[0]) / fitted.prior.steps[needles.begun, None, None],
-                depth,
-                fitted.grid,
-            )
+            _renew(old, needles.begun, (each[1:] - each[0]) / fitted.prior.steps[needles.begun, None, None], depth, fitted.grid)
             for old, each in zip(along_curves, whole, strict=True)
         )
     reached = zip(needles.begun, models[1:], states[1:], strict=True)

@@ -43,21 +43,7 @@ from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import (
-    DB_X,
-    PSI,
-    STILL,
-    THETA,
-    Floats,
-    Laterals,
-    Measurement,
-    Motion,
-    Needles,
-    Point,
-    Reading,
-    X,
-    Z,
-)
+from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Needles, Point, Reading, X, Z
 
 _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
@@ -278,11 +264,7 @@ class Identified(FittedInsertion):
 
     def _add(self, one: SensorFit, readings: Sequence[Reading]) -> SensorFit:
         """Return a sensor along the needle with new readings."""
-        return (
-            one.add(np.array([each.time for each in readings]), self._values(one, readings))
-            if readings
-            else one
-        )
+        return one.add(np.array([each.time for each in readings]), self._values(one, readings)) if readings else one
 
     def _values(self, one: SensorFit, readings: Sequence[Reading]) -> Floats:
         """Return the values (r, d) of readings."""
@@ -299,11 +281,7 @@ class Identified(FittedInsertion):
         bins = one.bin_at(time[-1:], self.timeline)
         slopes = self.along_slopes(between(bins, self.tips[:, X, None])[:, 0], k)
         jacobian = one.jacobian(bins, ends, slopes, self.parameters, self.timeline)[0]
-        known = (
-            jacobian @ self.covariance @ jacobian.T
-            + np.diag(one.model_sd**2)
-            + one.sensor.wander_sd**2 * np.eye(len(jacobian))
-        )
+        known = jacobian @ self.covariance @ jacobian.T + np.diag(one.model_sd**2) + one.sensor.wander_sd**2 * np.eye(len(jacobian))
         return Comparison(values, values - predicted, known, one.sensor.noise)
 
     def shape_sd(self, nodes: Floats) -> Floats:
@@ -371,9 +349,7 @@ class Identified(FittedInsertion):
     def tracked(self) -> bool:
         """True if the tracker measured the tip lately, so that it will again."""
         limit = self.nominal.scenario.control.hold_limit_s
-        return not self.along or (
-            bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit
-        )
+        return not self.along or (bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit)
 
     @property
     def roll_sd(self) -> float:

@@ -50,9 +50,7 @@ class Slots(NamedTuple):
 
     def is_offset(self, parameter: int) -> bool:
         """Return whether a parameter is an error of a measurement, without effect on the needle."""
-        return (
-            self.run_out.start <= parameter < self.tilt.stop or self.end is not None and parameter >= self.end
-        )
+        return self.run_out.start <= parameter < self.tilt.stop or self.end is not None and parameter >= self.end
 
 
 LEAST_SD = 1e-6

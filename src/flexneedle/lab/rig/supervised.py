@@ -15,9 +15,9 @@ from flexneedle.errors import DriverError, RefusedError, RigError
 from flexneedle.estimation.axial import carry_out
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.lab.rig.axis_columns import AxisColumns
-from flexneedle.lab.rig.diagnosis import explain_record
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.devices.opening import open_sensors
+from flexneedle.lab.rig.diagnosis import explain_record
 from flexneedle.lab.rig.dry_run import dry_run_ports
 from flexneedle.lab.rig.preflight.fit import (
     deepest_advance,

@@ -22,23 +22,11 @@ class VirtualSensor:
     """
 
     def __init__(
-        self,
-        sensor: Sensor,
-        phantom: Phantom,
-        axes: int,
-        depth: float,
-        length: float,
-        rng: np.random.Generator,
+        self, sensor: Sensor, phantom: Phantom, axes: int, depth: float, length: float, rng: np.random.Generator
     ) -> None:
         # Each quantity has its own generator, so that a change of one does not change the others.
         places, errors, self._rng, faults = rng.spawn(4)
-        self._sensor, self._phantom, self._axes, self._depth, self._length = (
-            sensor,
-            phantom,
-            axes,
-            depth,
-            length,
-        )
+        self._sensor, self._phantom, self._axes, self._depth, self._length = sensor, phantom, axes, depth, length
         self._mounted = sensor.mounted(places)
         self._gain = 1.0 + errors.normal(0.0, sensor.gain_sd)
         self._turn = errors.normal(0.0, math.radians(sensor.turn_sd_deg))

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
-
 class Fault(Section):
     """Table `phantom.fault` of a `[[sensor]]`: a fault of the virtual sensor."""
 
@@ -164,9 +163,7 @@ def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
         return np.full(size, np.nan)
     values: Floats = np.array(rows)[:, :axes].ravel()
     if values.size != size:
-        raise ValueError(
-            f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}"
-        )
+        raise ValueError(f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}")
     return values
 
 
