@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexneedle.errors import InputError, RigError
+from flexneedle.errors import DriverError, InputError, RigError
 from flexneedle.lab.rig.devices.fbg.calibration import read_calibration
 from flexneedle.lab.rig.devices.fbg.interrogator import make_sensor
 from flexneedle.scenario.sensors.fbg import Fbg
@@ -148,59 +148,80 @@ def test_what_is_no_json_is_refused(tmp_path):
 # The sensor
 
 
-class Source:
-    """An interrogator of a user."""
+STRAIGHT = wavelengths(0.0 * KAPPA) + 0.05
 
-    status, closed = "ok", False
+
+class Source:
+    """An interrogator of a user: a sample in each read, at first of the straight needle."""
 
     def __init__(self, clock):
-        self.clock, self.samples = clock, []
+        self.clock, self.status, self.closed, self.values = clock, "ok", False, STRAIGHT
         Source.newest = self
 
     def read(self):
-        taken, self.samples = self.samples, []
-        return taken
+        return [] if self.values is None else [(self.clock.now(), self.values)]
 
     def close(self):
         self.closed = True
 
 
+class Noisy(Source):
+    """It finds no peak of the last grating, and errs by ± 0.1 pm."""
+
+    def read(self):
+        values = STRAIGHT + 1e-4 * (-1) ** round(self.clock.now() / 0.02)
+        return [(self.clock.now(), np.append(values[:-1], np.nan) if self.clock.now() < 0.5 else values)]
+
+
+class Dark(Source):
+    def read(self):
+        self.status = "lamp off"
+        return []
+
+
+class Short(Source):
+    def read(self):
+        return [(0.0, STRAIGHT[:5])]
+
+
 @pytest.fixture
 def settings(file, monkeypatch):
-    parts = SimpleNamespace(Source=Source, halves=lambda _clock: object(), text="source")
-    monkeypatch.setitem(sys.modules, "bench", parts)
+    parts = {"halves": lambda _clock: object(), "text": "source"}
+    parts |= {each.__name__: each for each in (Source, Noisy, Dark, Short)}
+    monkeypatch.setitem(sys.modules, "bench", SimpleNamespace(**parts))
     return {"source": "bench:Source", "calibration": str(file()), "reference_s": 1.0}
 
 
-def test_shifts_count_from_the_straight_needle_at_the_start(settings):
-    sensor, straight = make_sensor(settings, ManualClock(), SENSOR), wavelengths(0.0 * KAPPA) + 0.05
-    Source.newest.samples = [(0.0, straight + 1e-4), (0.5, straight - 1e-4), (1.0, straight)]
-    assert sensor.read() == ()
-    assert sensor.status == "ok"
-    Source.newest.samples = [(2.0, straight + wavelengths(KAPPA) - wavelengths(0.0 * KAPPA))]
+@pytest.mark.parametrize("source", ["Source", "Noisy"])
+def test_shifts_count_from_the_straight_needle_at_the_start(settings, source):
+    clock = ManualClock()
+    sensor = make_sensor(settings | {"source": f"bench:{source}"}, clock, SENSOR)
+    assert clock.now() == pytest.approx(1.0)
+    sample = 2.0, STRAIGHT + wavelengths(KAPPA) - wavelengths(0.0 * KAPPA)
+    Source.newest.read = lambda: [sample]
     (reading,) = sensor.read()
     assert reading.time == pytest.approx(1.98)
     np.testing.assert_allclose(reading.rows, KAPPA[::-1], atol=2e-6)
+    Source.newest.status = "lamp off"
+    assert sensor.status == "lamp off"
     sensor.close()
     assert Source.newest.closed
 
 
-def test_until_then_there_are_no_readings_and_the_status_has_the_reason(settings):
-    sensor = make_sensor(settings, ManualClock(), SENSOR)
-    Source.newest.samples = [(0.5, wavelengths(KAPPA))]
-    assert sensor.read() == ()
-    assert sensor.status == "wavelengths of the straight needle are averaged for 1 s"
-    Source.newest.status = "lamp off"
-    assert sensor.status == "lamp off"
+@pytest.mark.parametrize(
+    ("source", "line"),
+    [("Dark", "no wavelengths within 1 s: lamp off"), ("Short", "5 wavelengths, expected 12")],
+)
+def test_without_the_straight_needle_it_is_not_opened(settings, source, line):
+    with pytest.raises(DriverError, match=line):
+        make_sensor(settings | {"source": f"bench:{source}"}, ManualClock(), SENSOR)
+    assert Source.newest.closed
 
 
 def test_a_lost_grating_leaves_out_its_site_and_a_wrong_number_of_them_all(settings):
-    sensor, straight = make_sensor(settings, ManualClock(), SENSOR), wavelengths(0.0 * KAPPA)
-    Source.newest.samples = [(0.0, straight), (1.0, straight)]
-    sensor.read()
-    lost = straight.copy()
+    sensor, lost = make_sensor(settings, ManualClock(), SENSOR), STRAIGHT.copy()
     lost[3] = np.nan  # channel 1 at the site next to the tip
-    Source.newest.samples = [(2.0, lost), (3.0, straight[:5])]
+    Source.newest.read = lambda: [(2.0, lost), (3.0, STRAIGHT[:5])]
     one, short = sensor.read()
     np.testing.assert_array_equal(np.isnan(one.rows)[:, 0], [True, False, False, False])
     assert (short.rows, short.status[:14]) == ((), "5 wavelengths,")

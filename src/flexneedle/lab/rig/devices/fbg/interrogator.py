@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from flexneedle.arguments import expand_home
-from flexneedle.errors import InputError, RigError
+from flexneedle.errors import DriverError, InputError, RigError
 from flexneedle.lab.rig.devices.fbg.calibration import NeedleCalibration, read_calibration
 from flexneedle.lab.rig.devices.fbg.mounting import MountingSettings, SiteMap, require_fbg
 from flexneedle.lab.rig.rig_file import check_settings
@@ -23,6 +23,7 @@ from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import VISIBLE, Floats, Reading
 
 _PARTS = ("read", "status", "close")
+_POLL_S = 0.02
 
 Text = Annotated[str, Field(max_length=4000), AfterValidator(one_line)]
 
@@ -35,7 +36,7 @@ class InterrogatorSettings(MountingSettings):
     calibration: Text
     """JSON file with the calibration of the needle."""
     reference_s: Positive = 2.0
-    """Time after the start in which the wavelengths of the straight needle are averaged, their shifts' zero."""
+    """Time at the start in which the wavelengths of the straight needle at rest are averaged: zero of the shifts."""
 
 
 class WavelengthSource(Protocol):
@@ -60,9 +61,9 @@ class WavelengthSource(Protocol):
 
 
 class Interrogator:
-    """The port `NeedleSensor` of wavelengths. Shifts count from their mean in the first `averaged` seconds.
+    """The port `NeedleSensor` of wavelengths.
 
-    delay: age of a sample on arrival (s).
+    reference: wavelengths (signals,) of the straight needle, nm; delay: age of a sample on arrival (s).
     """
 
     def __init__(
@@ -70,62 +71,75 @@ class Interrogator:
         source: WavelengthSource,
         calibration: NeedleCalibration,
         sites: SiteMap,
+        reference: Floats,
         delay: float,
-        averaged: float,
     ) -> None:
         self._source, self._calibration, self._map = source, calibration, sites
-        self._delay, self._averaged, self._first = delay, averaged, 0.0
-        self._straight = list[Floats]()
-        self._reference: Floats | None = None
+        self._reference, self._delay = reference, delay
 
     def read(self) -> tuple[Reading, ...]:
         """Return the readings since the last call, oldest first; may be empty."""
-        return tuple(
-            filter(None, (self._take(time, np.array(values, float)) for time, values in self._source.read()))
-        )
+        return tuple(self._make_reading(time, values) for time, values in self._source.read())
 
     @property
     def status(self) -> str:
         """VISIBLE while readings arrive, otherwise the reason in a few words."""
-        if self._source.status == VISIBLE and self._reference is None:
-            return f"wavelengths of the straight needle are averaged for {self._averaged:g} s"
         return self._source.status
 
     def close(self) -> None:
         """Disconnect."""
         self._source.close()
 
-    def _take(self, time: float, wavelengths: Floats) -> Reading | None:
-        """Return the reading of a sample, None if it is of the straight needle."""
-        if wavelengths.shape != (self._calibration.signals,):
-            rule = f"expected {self._calibration.signals}, for each channel and site of the calibration"
-            return Reading(time - self._delay, (), f"{wavelengths.size} wavelengths, {rule}")
-        if self._reference is None:
-            self._average(time, wavelengths)
-            return None
-        rows = self._map.to_rows(self._calibration.to_bends(wavelengths - self._reference))
-        return Reading(time - self._delay, rows, VISIBLE if rows else "no value is valid")
-
-    def _average(self, time: float, wavelengths: Floats) -> None:
-        """Add a sample of the straight needle."""
-        self._first = self._first if self._straight else time
-        self._straight.append(wavelengths)
-        if time - self._first >= self._averaged:
-            total, known = np.nansum(self._straight, axis=0), np.isfinite(self._straight).sum(axis=0)
-            self._reference = np.divide(total, known, out=np.full(total.shape, np.nan), where=known > 0)
-            self._straight.clear()
+    def _make_reading(self, time: float, values: Sequence[float]) -> Reading:
+        taken = time - self._delay
+        if problem := _count_problem(values, self._calibration):
+            return Reading(taken, (), problem)
+        rows = self._map.to_rows(self._calibration.to_bends(np.asarray(values) - self._reference))
+        return Reading(taken, rows, VISIBLE if rows else "no value is valid")
 
 
 def make_sensor(settings: Mapping[str, Any], clock: Clock, sensor: Sensor) -> Interrogator:
-    """Return the sensor of the settings of a rig file, for a sensor of the scenario.
+    """Return the sensor of the settings of a rig file, for a sensor of the scenario, after `reference_s`.
 
-    Raises RigError for invalid settings, InputError for an invalid calibration, and as the source.
+    Raises RigError for invalid settings, InputError for an invalid calibration, DriverError without wavelengths, and as
+    the source.
     """
     checked, fbg = check_settings(InterrogatorSettings, settings), require_fbg("interrogator", sensor)
     calibration = read_calibration(expand_home(checked.calibration))
     sites = SiteMap(calibration.positions, fbg.sites_mm, checked)
     source = _open_source(checked.source, clock)
-    return Interrogator(source, calibration, sites, fbg.delay_s, checked.reference_s)
+    try:
+        reference = _average(source, calibration, clock, checked.reference_s)
+    except BaseException:
+        source.close()
+        raise
+    return Interrogator(source, calibration, sites, reference, fbg.delay_s)
+
+
+def _average(
+    source: WavelengthSource, calibration: NeedleCalibration, clock: Clock, seconds: float
+) -> Floats:
+    """Return the mean wavelengths (signals,) of `seconds`, nm, NaN for a grating that was never found."""
+    samples, end = list[Sequence[float]](), clock.now() + seconds
+    while clock.now() < end:
+        clock.wait(min(_POLL_S, seconds))
+        samples += [values for _, values in source.read()]
+    if not samples:
+        raise DriverError(f"no wavelengths within {seconds:g} s: {source.status}")
+    if problem := next(filter(None, (_count_problem(values, calibration) for values in samples)), ""):
+        raise DriverError(problem)
+    total, known = np.nansum(samples, axis=0), np.isfinite(samples).sum(axis=0)
+    mean: Floats = np.divide(total, known, out=np.full(calibration.signals, np.nan), where=known > 0)
+    return mean
+
+
+def _count_problem(values: Sequence[float], calibration: NeedleCalibration) -> str:
+    """Return the problem of the number of wavelengths, or ""."""
+    if np.shape(values) == (calibration.signals,):
+        return ""
+    return (
+        f"{len(values)} wavelengths, expected {calibration.signals}: channels times sites of the calibration"
+    )
 
 
 def _open_source(name: str, clock: Clock) -> WavelengthSource:
