@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slicer docs lint clean
+.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl fuzz-fbgs robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slicer docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -10,7 +10,7 @@ PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 # Targets that run scripts, each with a quick mode.
-SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slow docs
+SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl fuzz-fbgs robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slow docs
 
 # With QUICK=1 each of them does everything that it does, on a few cases, in seconds; results go to a temporary folder.
 quick = $(if $(QUICK),$(1))
@@ -72,7 +72,7 @@ quick: kernels  ## try demo and every target below with few cases, as QUICK=1 do
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
 	  $(MAKE) --jobs 3 --keep-going --output-sync=target QUICK=1 RUNS="$$folder" $(SCRIPTS)
 
-bench: setup  ## measure speed: commands, mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics, OpenIGTLink
+bench: setup  ## measure speed: commands, mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics, OpenIGTLink, an FBGS stream
 	$(BIN)/python benchmarks/bench.py $(call quick,--quick)
 	$(BIN)/python benchmarks/waiting.py $(call quick,--quick)
 	$(BIN)/python benchmarks/plant.py $(call quick,--phantoms 2)
@@ -83,6 +83,7 @@ bench: setup  ## measure speed: commands, mechanics, the exact plant, control pe
 	$(BIN)/python benchmarks/ros.py $(call quick,--periods 20 --stops 3)
 	$(BIN)/python benchmarks/ros_stop.py $(call quick,--stops 2)
 	$(BIN)/python benchmarks/igtl.py $(call quick,--quick)
+	$(BIN)/python benchmarks/fbgs.py $(call quick,--quick)
 
 compare: setup  ## compare the speed of this checkout with another one in pairs (BEFORE=path; an hour)
 	$(BIN)/python benchmarks/compare.py --before $(or $(BEFORE),$(call quick,.)) $(call quick,--quick)
@@ -116,6 +117,9 @@ fuzz-ros: setup  ## a million random and damaged messages to the readers of ROS 
 
 fuzz-igtl: setup  ## a million random and damaged OpenIGTLink messages to the decoder, and to a running server
 	$(BIN)/python campaigns/fuzz_igtl.py $(call quick,--inputs 1000)
+
+fuzz-fbgs: setup  ## a million random and damaged frames to the decoder of an FBGS stream, and to a connected sensor
+	$(BIN)/python campaigns/fuzz_fbgs.py $(call quick,--inputs 1000)
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
 	$(BIN)/python studies/robustness.py $(call quick,--sequences 200)

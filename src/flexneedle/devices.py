@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.errors import DriverError, RigError
-from flexneedle.lab.rig.devices.opening import MotorsFactory, TrackerFactory
+from flexneedle.lab.rig.devices.opening import MotorsFactory, SensorFactory, TrackerFactory
 from flexneedle.lab.rig.rig_file import check_settings
-from flexneedle.ports import Clock, MotorPaces, Motors, MotorSetup, MotorState, Tracker
+from flexneedle.ports import Clock, MotorPaces, Motors, MotorSetup, MotorState, NeedleSensor, Tracker
 from flexneedle.scenario.sections.fields import Section
-from flexneedle.types import VISIBLE, Frame, SensorReading
+from flexneedle.types import VISIBLE, Frame, Reading, SensorReading
 
 if TYPE_CHECKING:
     from flexneedle.lab.rig.rig_file import RigFile
@@ -27,8 +27,11 @@ __all__ = [
     "MotorState",
     "Motors",
     "MotorsFactory",
+    "NeedleSensor",
+    "Reading",
     "RigError",
     "Section",
+    "SensorFactory",
     "SensorReading",
     "Tick",
     "Tracker",

@@ -163,7 +163,7 @@ MUTANTS = [
     (of_device(with_values(Device, number=0)), "test_frames_are_in_their_order"),
     (of_device(with_values(Device, sensor="needle")), "test_needle_sensor_has_positions"),
     (of_device(with_values(Device, position=None)), "test_needle_sensor_has_positions"),
-    (of_device(with_values(Device, status="starting")), "test_frames_arrive_at_their_rate"),
+    (of_device(with_values(Device, status="starting")), "test_arrives_at_its_rate"),
     (of_device(with_values(Device, status=None)), "test_has_the_parts_of_the_port"),
     (of_device(with_values(Device, takes=0.5)), "test_read_does_not_wait"),
     (of_device(ChangesItsFrames), "test_frames_do_not_change"),

@@ -73,7 +73,7 @@ def heading(table: Table) -> str:
     """Return the heading of a section."""
     name = (
         f"[[{table.name}]]"
-        if table.name.endswith(("tissue", "terms", "zone", "layer"))
+        if table.name.endswith(("tissue", "terms", "zone", "layer", "sensor"))
         else f"[{table.name}]"
     )
     return f"## `{name}`" if table.name else "## Top level"

@@ -145,6 +145,7 @@ _TYPE_RULES = {
     "bool_type": "must be true or false",
     "string_type": "must be text in quotes",
     "tuple_type": "must be a list",
+    "list_type": "must be a list",
     "model_type": "must be a table",
 }
 

@@ -19,7 +19,7 @@ from flexneedle.control.interface import Decision
 from flexneedle.errors import CommandError, DriverError, RefusedError, RigError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.axis_columns import AxisColumns
-from flexneedle.lab.rig.rig_file import load_rig
+from flexneedle.lab.rig.rig_file import SensorSection, load_rig
 from flexneedle.lab.rig.supervised import SupervisedDriver, SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
@@ -31,7 +31,7 @@ from flexneedle.record.topics import READINGS
 from flexneedle.results import Action
 from flexneedle.simulator.control import travel_time
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import UNKNOWN, Control, Pose
+from flexneedle.types import UNKNOWN, Control, Pose, Reading
 from stages import RIG
 from synthetic import make_plan
 from traces import contents
@@ -212,6 +212,28 @@ def opened(monkeypatch):
 def test_the_tip_is_measured_again_after_the_confirmation(opened):
     rest = Resting(tips=[(-28.5, 0.0, 0.0), (-27.0, 0.0, 0.0)])
     assert opened(rest) == ["read", "asked", "read", ("armed", 69.0), "rotation", "closed"]
+
+
+def test_the_loop_gets_the_sensors_of_the_rig_and_in_a_dry_run_virtual_ones(monkeypatch):
+    closed = []
+
+    def gratings(_settings, clock, sensor):
+        reading = Reading(clock.now(), ((1e-3, 0.0),) * len(sensor.sites_mm))
+        found = [(reading,), (reading,)]  # before and after the start
+        return SimpleNamespace(read=found.pop, status="ok", close=lambda: closed.append(sensor.title))
+
+    monkeypatch.setitem(sys.modules, "own", SimpleNamespace(gratings=gratings))
+    monkeypatch.setattr("flexneedle.lab.rig.supervised.SupervisorClient", Resting())
+    parts = (SensorSection(name="fbg", kind="own:gratings"),)
+    rig = load_rig("emulated").model_copy(update={"sensor": parts})
+    scenario = PHANTOM.with_values({"sensor": [{"kind": "fbg", "sites_mm": [20.0, 60.0]}]})
+    plan = make_plan("manipulation", (40.0, 5.0, 0.0), 0)
+    for dry in (False, True):
+        with SupervisedRig(rig, dry_run=dry).open(scenario, plan, 0, Stream(gate=Gate())) as ports:
+            assert list(ports.sensors) == ["fbg"]
+            assert len(ports.sensors["fbg"].read()) == (0 if dry else 1)
+            assert closed == ["fbg"] * dry
+    assert closed == ["fbg"]
 
 
 def test_the_needle_rolls_at_the_scenarios_speed(opened):

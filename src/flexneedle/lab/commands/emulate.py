@@ -26,7 +26,7 @@ def add_parser(commands: Commands) -> None:
         commands,
         "emulate",
         "emulate a device, for tests without hardware",
-        (_add_aurora, _add_galil, _add_rig),
+        (_add_aurora, _add_galil, _add_fbgs, _add_rig),
         "flexneedle emulate aurora --link /tmp/aurora",
         "flexneedle emulate rig emulated phantom",
         title="devices",
@@ -75,14 +75,34 @@ def _add_galil(commands: Commands) -> None:
         about="Print the address of the emulated controller and serve it until Ctrl-C or SIGTERM. Its four motors "
         "move in real time.",
     )
-    galil.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
-    )
-    galil.add_argument(
-        "--port", type=port, default=0, metavar="N", help="port to listen on (default: any free port)"
-    )
+    _add_address(galil)
     _add_fault(galil, "a fault at SECONDS after the first motion", "docs/rig/galil.md")
     add_seed(galil, "seed of corrupted bytes")
+
+
+def _add_fbgs(commands: Commands) -> None:
+    fbgs = add_command(
+        commands,
+        "fbgs",
+        "an FBGS ShapeCore on a TCP port",
+        _emulate_fbgs,
+        "flexneedle emulate fbgs --port 50012",
+        "flexneedle emulate fbgs --port 50012 --fault unplug@5:2",
+        about="Print the address of the emulated stream and send 100 frames a second to each client until Ctrl-C or "
+        "SIGTERM. The fibre has the shape of an arc that turns about its axis.",
+    )
+    _add_address(fbgs)
+    _add_fault(fbgs, "a fault at SECONDS after the first client has connected", "docs/rig/fbgs.md")
+    add_seed(fbgs, "seed of changed bytes")
+
+
+def _add_address(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
+    )
+    parser.add_argument(
+        "--port", type=port, default=0, metavar="N", help="port to listen on (default: any free port)"
+    )
 
 
 def _add_rig(commands: Commands) -> None:
@@ -168,6 +188,25 @@ def _emulate_galil(args: argparse.Namespace) -> int:
         try:
             print("{}:{}".format(*tcp.address), flush=True)
             session = GalilSession(ControllerState(), faults, monotonic(), args.seed)
+            serve(session, tcp, _orders(), lambda line: print_line(execute(session, line)), print_line)
+        except KeyboardInterrupt:
+            return 0
+
+
+def _emulate_fbgs(args: argparse.Namespace) -> int:
+    from time import monotonic
+
+    from flexneedle.lab.emulators.faults import parse_fault
+    from flexneedle.lab.emulators.fbgs import FAULTS, FbgsServer, FbgsSession, execute, serve
+    from flexneedle.lab.rig.devices.priority import set_realtime_priority
+
+    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
+    with FbgsServer(args.host, args.port) as tcp:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        set_realtime_priority()  # a real device does not wait for other processes on this machine
+        try:
+            print("{}:{}".format(*tcp.address), flush=True)
+            session = FbgsSession(faults, monotonic(), args.seed)
             serve(session, tcp, _orders(), lambda line: print_line(execute(session, line)), print_line)
         except KeyboardInterrupt:
             return 0

@@ -55,11 +55,11 @@ class DryRunPorts:
 
 
 def dry_run_ports(supervised: Rig, virtual: Rig) -> Rig:
-    """Return the rig of a dry run: supervised motions, and the needle and tracker of a virtual rig.
+    """Return the rig of a dry run: supervised motions, and the needle and sensors of a virtual rig.
 
     Raises InputError if that has no phantom.
     """
     if not isinstance(virtual.driver, Phantom):
         raise InputError("a dry run needs a virtual phantom")
     ports = DryRunPorts(supervised, virtual, virtual.driver)
-    return Rig(ports, ports, ports, ports.condition)
+    return Rig(ports, ports, ports, ports.condition, sensors=virtual.sensors)

@@ -45,6 +45,13 @@ class DeviceSection(Section):
         return dict(self.model_extra or {})
 
 
+class SensorSection(DeviceSection):
+    """Sensor along the needle and its settings, which the device checks."""
+
+    name: Title
+    """Name of the sensor in the scenario: its `name`, or its `kind` without one."""
+
+
 class LoopSettings(Section):
     """Section `loop`: timing of the supervisor and the decisions."""
 
@@ -108,6 +115,8 @@ class RigFile(Section):
     driver: DeviceSection
     axes: Axes
     tracker: DeviceSection
+    sensor: Annotated[tuple[SensorSection, ...], Field(strict=False, max_length=100)] = ()
+    """Devices of the sensors along the needle that the scenario has, one for each."""
     registration: Registration | None = None
     """Replaces the registration of the scenario."""
     loop: LoopSettings = LoopSettings()
@@ -122,8 +131,16 @@ class RigFile(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse(_queue_problems(self))
+        refuse((*_queue_problems(self), *_name_problems(self)))
         return self
+
+
+def _name_problems(rig: RigFile) -> Iterator[Problem]:
+    """Yield the problem of each name that an earlier sensor has."""
+    names = [one.name for one in rig.sensor]
+    for n, name in enumerate(names):
+        if name in names[:n]:
+            yield Problem(("sensor", n, "name"), name, "another sensor has this name")
 
 
 def _queue_problems(rig: RigFile) -> Iterator[Problem]:

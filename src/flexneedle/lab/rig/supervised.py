@@ -15,6 +15,8 @@ from flexneedle.errors import DriverError, RefusedError, RigError
 from flexneedle.estimation.axial import carry_out
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.lab.rig.axis_columns import AxisColumns
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.opening import open_sensors
 from flexneedle.lab.rig.diagnosis import explain_record
 from flexneedle.lab.rig.dry_run import dry_run_ports
 from flexneedle.lab.rig.preflight.fit import (
@@ -249,7 +251,11 @@ class SupervisedRig(RigSource):
             self.ticks.add(found)
             stream.send(Tick(found))
 
-        with SupervisorClient(task, report) as supervisor:
+        clock = WallClock(start=task.started)
+        with (
+            SupervisorClient(task, report) as supervisor,
+            open_sensors(() if self.dry_run else rig.sensor, scenario.sensor, clock) as sensors,
+        ):
             # An insertion without room is refused before anybody is asked.
             check_room(supervisor, scenario, plan, dry=self.dry_run)
             stream.gate.confirm(supervisor)
@@ -262,7 +268,11 @@ class SupervisedRig(RigSource):
                 supervisor.wait(scenario.monitor.indicator_window_s)
             driver = SupervisedDriver(supervisor, scenario, plan.roll)
             deadline = 1e-3 * rig.loop.decision_ms
-            ports = Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
+            for sensor in sensors.values():
+                sensor.read()  # of the needle before the start
+            ports = Rig(
+                supervisor, driver, supervisor, expect=driver.expect, deadline=deadline, sensors=sensors
+            )
             if self.dry_run:
                 ports = dry_run_ports(ports, virtual_rig(virtual, plan.roll, Seeds.of(seed)))
             yield ports

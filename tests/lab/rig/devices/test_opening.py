@@ -151,9 +151,9 @@ def test_a_tracker_is_closed_by_its_close_or_as_a_context_manager():
     tracker = open_tracker(rig(tracker={"kind": "parts:managed"}), clock)
     clock.wait(0.1)
     assert (len(tracker.read()), tracker.status) == (4, "ok")
-    assert not tracker.tracker.closed
+    assert not tracker.device.closed
     tracker.close()
-    assert tracker.tracker.closed
+    assert tracker.device.closed
 
 
 def test_errors_of_the_package_in_a_device_are_errors_of_the_driver():

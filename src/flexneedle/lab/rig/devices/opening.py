@@ -1,4 +1,4 @@
-"""Open the driver and the tracker of a rig file, and check their calls.
+"""Open the driver, the tracker and the sensors of a rig file, and check their calls.
 
 A factory makes a device from its settings in the rig file. It raises InputError (`key = value: rule`) for invalid
 settings, and returns the device open and at rest. A package registers a factory as an entry point:
@@ -8,8 +8,8 @@ settings, and returns the device open and at rest. A package registers a factory
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import entry_points
@@ -22,7 +22,7 @@ import numpy as np
 from flexneedle.arguments import shorten
 from flexneedle.errors import DriverError, FlexneedleError, InputError, RigError, make_printable, one_line
 from flexneedle.lab.rig.preflight.speeds import pace_problems
-from flexneedle.lab.rig.rig_file import DeviceSection, RigFile
+from flexneedle.lab.rig.rig_file import DeviceSection, RigFile, SensorSection
 from flexneedle.plugins import (
     convert_exceptions,
     function_rule,
@@ -31,16 +31,19 @@ from flexneedle.plugins import (
     name_kind,
     parts_of,
 )
-from flexneedle.ports import Clock, Motors, MotorSetup, MotorState, Tracker
-from flexneedle.types import Frame, Point, Quaternion, SensorReading
+from flexneedle.ports import Clock, Motors, MotorSetup, MotorState, NeedleSensor, Tracker
+from flexneedle.scenario.sensors.sensor import Sensor
+from flexneedle.types import Frame, Point, Quaternion, Reading, SensorReading
 
-DRIVERS, TRACKERS = "flexneedle.drivers", "flexneedle.trackers"
+DRIVERS, TRACKERS, SENSORS = "flexneedle.drivers", "flexneedle.trackers", "flexneedle.sensors"
 """Groups of entry points."""
 
 MotorsFactory = Callable[[Mapping[str, Any], Sequence[str]], Motors]
 """Makes the motors of a driver from its settings and the channels of the rig's axes."""
 TrackerFactory = Callable[[Mapping[str, Any], Clock], Tracker]
 """Makes a tracker from its settings and the clock of the run; it has `close`, or is a context manager."""
+SensorFactory = Callable[[Mapping[str, Any], Clock, Sensor], NeedleSensor]
+"""Makes a sensor along the needle from its settings, the clock of the run and the scenario's sensor; as a tracker."""
 
 Rule = Callable[[Any], str]
 """Returns the rule that a value breaks, or ""."""
@@ -54,6 +57,14 @@ class OpenTracker(Tracker, Protocol):
 
     def close(self) -> None:
         """Stop tracking and release the device."""
+        ...
+
+
+class OpenNeedleSensor(NeedleSensor, Protocol):
+    """A sensor along the needle that has to be closed."""
+
+    def close(self) -> None:
+        """Stop measuring and release the device."""
         ...
 
 
@@ -113,10 +124,39 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
     name = _label("tracker", rig.tracker)
     with convert_exceptions(name):
         made = _call_factory("tracker", rig.tracker, lambda: factory(rig.tracker.settings, clock))
-        opened = _with_close(rig.tracker, made)
-    owner = type(opened.tracker if isinstance(opened, _Entered) else opened).__name__
-    tracker: OpenTracker = GuardedDevice(name, owner, opened, _TRACKER)
+        tracker: OpenTracker = _guard("tracker", rig.tracker, made, parts_of(Tracker), _TRACKER)
     return tracker
+
+
+@contextmanager
+def open_sensors(
+    parts: Sequence[SensorSection], sensors: Sequence[Sensor], clock: Clock
+) -> Iterator[dict[str, OpenNeedleSensor]]:
+    """Open sensors along the needle, and yield them by name.
+
+    Args:
+        parts: Sensors of a rig file.
+        sensors: Sensors of the scenario, one for each of the rig file (`fit_problems`).
+        clock: The clock of the run, on which readings have their times.
+
+    Raises:
+        RigError, RunError, DriverError: As in `open_tracker`.
+    """
+    wanted = {one.title: one for one in sensors}
+    with ExitStack() as stack:
+        yield {
+            one.name: stack.enter_context(closing(open_sensor(one, wanted[one.name], clock))) for one in parts
+        }
+
+
+def open_sensor(part: SensorSection, sensor: Sensor, clock: Clock) -> OpenNeedleSensor:
+    """Return a sensor along the needle, started; `close` stops it. Raises as `open_tracker`."""
+    section = f"sensor {part.name}"
+    factory = _load_factory(section, SENSORS, part, ("settings", "clock", "sensor"))
+    with convert_exceptions(_label(section, part)):
+        made = _call_factory(section, part, lambda: factory(part.settings, clock, sensor))
+        opened: OpenNeedleSensor = _guard(section, part, made, parts_of(NeedleSensor), _SENSOR)
+    return opened
 
 
 def address_of(part: DeviceSection, motors: Motors) -> str:
@@ -164,34 +204,43 @@ def _refusal(section: str, part: DeviceSection, rule: str) -> RigError:
 
 @dataclass(frozen=True)
 class _Entered:
-    """A tracker that was entered as a context manager."""
+    """A tracker or sensor that was entered as a context manager."""
 
-    tracker: Tracker
-    manager: AbstractContextManager[Tracker]
+    device: Any
+    manager: AbstractContextManager[Any]
 
-    def read(self) -> tuple[Frame, ...]:
-        return self.tracker.read()
+    def read(self) -> Any:
+        return self.device.read()
 
     @property
     def status(self) -> str:
-        return self.tracker.status
+        status: str = self.device.status
+        return status
 
     def close(self) -> None:
         self.manager.__exit__(None, None, None)
 
 
-def _with_close(part: DeviceSection, made: Any) -> OpenTracker:
-    """Return a tracker with `close`, of a tracker or a context manager. Raises RigError for anything else."""
+def _guard(
+    section: str, part: DeviceSection, made: Any, parts: Sequence[str], rules: Mapping[str, Rule]
+) -> Any:
+    """Return a tracker or sensor with `close`, guarded. Raises RigError if it lacks a part."""
+    opened = _with_close(section, part, made, parts)
+    owner = type(opened.device if isinstance(opened, _Entered) else opened).__name__
+    return GuardedDevice(_label(section, part), owner, opened, rules)
+
+
+def _with_close(section: str, part: DeviceSection, made: Any, parts: Sequence[str]) -> Any:
+    """Return a device with `close`, of a device or a context manager. Raises RigError for anything else."""
     if hasattr(made, "close"):
-        _check_parts("tracker", part, made, parts_of(Tracker))
-        tracker: OpenTracker = made
-        return tracker
+        _check_parts(section, part, made, parts)
+        return made
     if not isinstance(made, AbstractContextManager):
         rule = f"made {name_kind(made)} that cannot be closed: it needs close(), or to be a context manager"
-        raise _refusal("tracker", part, rule)
-    entered = _call_factory("tracker", part, made.__enter__)
+        raise _refusal(section, part, rule)
+    entered = _call_factory(section, part, made.__enter__)
     try:
-        _check_parts("tracker", part, entered, parts_of(Tracker))
+        _check_parts(section, part, entered, parts)
     except RigError:
         made.__exit__(None, None, None)
         raise
@@ -269,8 +318,20 @@ def frames_rule(value: object) -> str:
     return next(filter(None, map(_frame_rule, value)), "")
 
 
+def readings_rule(value: object) -> str:
+    """Return the rule that the result of `NeedleSensor.read` breaks."""
+    if not isinstance(value, tuple | list):
+        return f"must be a tuple of Reading, not {_kind(value)}"
+    for one in value:
+        if not isinstance(one, Reading):
+            return f"must be a tuple of Reading, but one is {_kind(one)}"
+    problem = next(filter(None, map(_record_rule, value)), "")
+    return problem and f"Reading: {problem}"
+
+
 _MOTORS = {"identity": text_rule, "address": text_rule, "read": states_rule, "setup": setups_rule}
 _TRACKER = {"status": text_rule, "read": frames_rule}
+_SENSOR = {"status": text_rule, "read": readings_rule}
 
 
 def _frame_rule(frame: object) -> str:

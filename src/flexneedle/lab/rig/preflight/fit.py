@@ -52,8 +52,29 @@ def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation
         *_base_turn_problems(scenario, strategy),
         *_rotation_problems(rig, scenario),
         *_rate_problems(rig, scenario),
+        *_sensor_problems(rig, scenario),
     ]
     return [to_line(problem) for problem in found]
+
+
+def _sensor_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
+    """Yield sensors along the needle that only the rig or only the scenario has."""
+    wanted, given = [one.title for one in scenario.sensor], [one.name for one in rig.sensor]
+    for n, name in enumerate(given):
+        if name not in wanted:
+            rule = (
+                f"must be a sensor of the scenario, one of {', '.join(wanted)}"
+                if wanted
+                else "the scenario has no sensor"
+            )
+            yield Problem(("sensor", n, "name"), name, rule)
+    for name in wanted:
+        if name not in given:
+            yield Problem(
+                "sensor",
+                None,
+                f'the rig has no device for {name}: add [[sensor]] with name = "{name}" to its file',
+            )
 
 
 def room_problem(rig: RigFile, scenario: Scenario, position: float) -> str:

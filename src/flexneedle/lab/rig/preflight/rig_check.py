@@ -8,20 +8,27 @@ from statistics import median
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, one_line
-from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
+from flexneedle.lab.rig.devices.opening import (
+    OpenNeedleSensor,
+    OpenTracker,
+    open_motors,
+    open_sensor,
+    open_tracker,
+)
 from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, limits_problem, room_problem
 from flexneedle.lab.rig.preflight.moves import describe_uncertainty
 from flexneedle.lab.rig.preflight.speeds import describe_speed, step_time
 from flexneedle.lab.rig.preflight.start import axis_start_problem, tip_problems, with_registration
 from flexneedle.lab.rig.rig_axes import Axis
-from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.rig_file import RigFile, SensorSection
 from flexneedle.lab.rig.supervisor.checks import active_switches, resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.loop.virtual import to_stage
 from flexneedle.phantom.tracking.stage import median_pose, tip_on_stage
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import TIP, VISIBLE, Frame, Point, is_reference
+from flexneedle.scenario.sensors.sensor import Sensor
+from flexneedle.types import TIP, VISIBLE, Frame, Point, Reading, is_reference
 
 _PAUSE_S = 0.01
 _READINGS = 5  # of the motors, for the time of a reply
@@ -79,7 +86,25 @@ def check_rig(
         lambda: open_tracker(rig, clock),
         lambda t: check_tracker(rig, t, clock, seconds, wanted, rolls[-1]),
     )
+    sensors = () if wanted is None else wanted.scenario.sensor
+    for part in rig.sensor:
+        found += _sensor_part_findings(part, sensors, clock, seconds)
     return found
+
+
+def _sensor_part_findings(
+    part: SensorSection, sensors: Sequence[Sensor], clock: Clock, seconds: float
+) -> list[Finding]:
+    """Return the findings of a sensor along the needle, none if it is no sensor of the scenario."""
+    name, wanted = f"sensor {part.name}", next((one for one in sensors if one.title == part.name), None)
+    if wanted is None:
+        return []
+    return check_device(
+        name,
+        part.kind,
+        lambda: open_sensor(part, wanted, clock),
+        lambda device: check_sensor(name, wanted, device, clock, seconds),
+    )
 
 
 def check_device(
@@ -239,7 +264,7 @@ def check_tracker(
     roll: float = 0.0,
 ) -> list[Finding]:
     """Return the findings of the frames of `seconds`. roll: of the needle (rad). Raises RunError after a failure."""
-    frames = _collect_frames(device, clock, seconds)
+    frames: list[Frame] = _collect(device, clock, seconds)
     if not frames:
         reason = "no frame" if device.status == VISIBLE else f"no frame: {device.status}"
         return [Finding("tracker", "frames", f"none in {seconds:g} s", reason)]
@@ -253,12 +278,40 @@ def check_tracker(
     ]
 
 
-def _collect_frames(device: OpenTracker, clock: Clock, seconds: float) -> list[Frame]:
-    begun, frames = clock.now(), list[Frame]()
+def check_sensor(
+    name: str, wanted: Sensor, device: OpenNeedleSensor, clock: Clock, seconds: float
+) -> list[Finding]:
+    """Return the findings of the readings of `seconds` of a sensor along the needle."""
+    readings: list[Reading] = _collect(device, clock, seconds)
+    rate = len(readings) / seconds
+    slow = (
+        f"rate_hz of the scenario is {wanted.rate_hz:g}"
+        if rate < (1.0 - _RATE_TOLERANCE) * wanted.rate_hz
+        else ""
+    )
+    measured = [one for one in readings if any(isfinite(value) for row in one.rows for value in row)]
+    shown = (
+        [", ".join(f"{value:.4g}" for value in row) for row in measured[-1].rows] if measured else ["none"]
+    )
+    few = 2 * len(measured) <= len(readings)
+    reason = readings[-1].status if readings else "no reading"
+    status = device.status
+    return [
+        Finding(name, "readings", f"{rate:.1f} Hz", slow),
+        Finding(name, "status", status, "" if status == VISIBLE else "must be ok while readings arrive"),
+        Finding(
+            name, "values", "; ".join(shown), f"in less than half of the readings: {reason}" if few else ""
+        ),
+    ]
+
+
+def _collect(device: Any, clock: Clock, seconds: float) -> list[Any]:
+    """Return what a device measures in `seconds`."""
+    begun, found = clock.now(), list[Any]()
     while clock.now() - begun < seconds:
-        frames += device.read()
+        found += device.read()
         clock.wait(_PAUSE_S)
-    return frames
+    return found
 
 
 def _rate_finding(frames: Sequence[Frame], wanted: IntendedInsertion | None) -> Finding:

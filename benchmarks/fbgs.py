@@ -1,0 +1,100 @@
+"""Read an emulated FBGS stream with four sensors: python benchmarks/fbgs.py [--seconds S] [--quick] [--json].
+
+The device is another process; the four sensors are in this one. Prints for 100 frames a second, each of 15.8 kB like a
+captured one: frames and lost frames of each sensor, the time from the device's stamp to the reading, the duration of
+`read()`, the processor time of a sensor; and the duration of a fixed computation in this process without and beside the
+four sensors: what they cost a control period. To judge the machine: processor time taken by the host (Linux in a
+virtual machine). Exit status 1 if a frame was lost or the 99 % quantile of the time is above 5 ms. With --quick, one
+second, nothing is judged.
+"""
+
+import sys
+import time
+from contextlib import ExitStack, closing
+from typing import Any
+
+import numpy as np
+from measuring import parser_of, quantiles, running, show, steal
+
+from flexneedle.lab.emulators.fbgs import POSITIONS_MM
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.fbg.fbgs import FbgsSensor, FbgsSettings
+from flexneedle.scenario.sensors.fbg import Fbg
+
+SENSORS, PERIOD_S, BAR_MS = 4, 0.2, 5.0
+SITES_MM = (20.0, 50.0, 80.0, 105.0)
+
+
+class TimedSensor(FbgsSensor):
+    """A sensor that keeps the line and the delay (s) of each frame; the emulated device stamps monotonic time."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.lines, self.delays = list[int](), list[float]()
+        super().__init__(*arguments)
+
+    def _take(self, frames: Any, arrival: float) -> None:
+        super()._take(frames, arrival)
+        now = time.monotonic()
+        self.lines += [one.line for one in frames]
+        self.delays += [now - one.stamp for one in frames]
+
+    @property
+    def lost(self) -> int:
+        """Frames that did not arrive."""
+        return self.lines[-1] - self.lines[0] + 1 - len(self.lines)
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--quick", action="store_true", help="one second, nothing is judged")
+    args = parser.parse_args()
+    stolen = steal()
+    found = measure(1.0 if args.quick else args.seconds)
+    found["processor time taken by the host, s"] = round(steal() - stolen, 1)
+    show(found, as_json=args.json)
+    return int(not args.quick and (found["frames lost"] > 0 or found["after stamp, 99 %, ms"] > BAR_MS))
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    """Return the figures of `seconds` with idle sensors, and of the computation without and beside them."""
+    alone = measure_computation(seconds / 4)
+    with running(sys.executable, "-m", "flexneedle", "emulate", "fbgs") as (_, address), ExitStack() as stack:
+        host, _, port = address.rpartition(":")
+        settings = FbgsSettings(host=host, port=int(port), positions_mm=POSITIONS_MM, first=3)
+        clock, wanted = WallClock(), Fbg(kind="fbg", sites_mm=SITES_MM)
+        sensors = [stack.enter_context(closing(TimedSensor(settings, clock, wanted))) for _ in range(SENSORS)]
+        reads, begun, used = list[float](), time.monotonic(), time.process_time()
+        while time.monotonic() - begun < seconds:
+            time.sleep(PERIOD_S)
+            for one in sensors:
+                at = time.perf_counter()
+                one.read()
+                reads.append(time.perf_counter() - at)
+        share = (time.process_time() - used) / seconds / SENSORS
+        delays = [delay for one in sensors for delay in one.delays]
+        beside = measure_computation(seconds / 4)
+        return (
+            {"frames": [len(one.lines) for one in sensors], "frames lost": sum(one.lost for one in sensors)}
+            | quantiles("after stamp", delays)
+            | quantiles("read()", reads)
+            | {"processor of a sensor, %": round(100.0 * share, 2)}
+            | quantiles("computation alone", alone)
+            | quantiles("computation beside the sensors", beside)
+        )
+
+
+def measure_computation(seconds: float) -> list[float]:
+    """Return the durations (s) of a computation of about 20 ms in Python and NumPy, as between two moves."""
+    taken, begun, matrix = list[float](), time.monotonic(), np.eye(64)
+    while time.monotonic() - begun < seconds:
+        at = time.perf_counter()
+        for _ in range(600):
+            matrix = np.tanh(matrix @ matrix.T)
+        taken.append(time.perf_counter() - at)
+    return taken
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Fibre Bragg gratings along the needle: FBGS ShapeCore and interrogators of wavelengths."""
