@@ -41,9 +41,22 @@ from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Needles, Point, Reading, X, Z
+from flexneedle.types import (
+    DB_X,
+    PSI,
+    STILL,
+    THETA,
+    Floats,
+    Laterals,
+    Measurement,
+    Motion,
+    Needles,
+    Point,
+    Reading,
+    X,
+    Z,
+)
 
 _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
@@ -230,7 +243,7 @@ class Identified(FittedInsertion):
     @property
     def _tip_slope(self) -> Laterals:
         """Derivatives (K,) of the tip's lateral position to the parameters."""
-        slope = self.slopes(self.state.tip[:1])[0]
+        slope: Laterals = self.slopes(self.state.tip[:1])[0]
         slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
         return slope
 
@@ -255,17 +268,22 @@ class Identified(FittedInsertion):
         return self.axial_bias, y, z
 
     def without_field(self, left: Laterals) -> Laterals:
-        """Return residuals (r,) of the tip's position without the error of the tracker's field, as far as it is known."""
+        """Return residuals (r,) of the tip's position without the known part of the field's error."""
         if self.field_sd == 0.0:
             return left
         field = Whitening.of(self, self.variances()[0])
         lower = field.lower
         covariance = lower @ lower.T - np.diag(field.variance)
-        return left - covariance @ np.linalg.solve(lower.T, np.linalg.solve(lower, left))
+        without: Laterals = left - covariance @ np.linalg.solve(lower.T, np.linalg.solve(lower, left))
+        return without
 
     def _add(self, one: SensorFit, readings: Sequence[Reading]) -> SensorFit:
         """Return a sensor along the needle with new readings."""
-        return one.add(np.array([each.time for each in readings]), self._values(one, readings)) if readings else one
+        return (
+            one.add(np.array([each.time for each in readings]), self._values(one, readings))
+            if readings
+            else one
+        )
 
     def _values(self, one: SensorFit, readings: Sequence[Reading]) -> Floats:
         """Return the values (r, d) of readings."""
@@ -283,7 +301,11 @@ class Identified(FittedInsertion):
         depth = self.depths(bins)
         slopes = self.along_slopes(depth, k)
         jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)[0]
-        known = jacobian @ self.covariance @ jacobian.T + np.diag(one.model_sd**2) + one.sensor.wander_sd**2 * np.eye(len(jacobian))
+        known = (
+            jacobian @ self.covariance @ jacobian.T
+            + np.diag(one.model_sd**2)
+            + one.sensor.wander_sd**2 * np.eye(len(jacobian))
+        )
         return Comparison(values, values - predicted, known, one.sensor.noise)
 
     def shape_sd(self, nodes: Floats) -> Floats:
@@ -351,7 +373,9 @@ class Identified(FittedInsertion):
     def tracked(self) -> bool:
         """True if the tracker measured the tip lately, so that it will again."""
         limit = self.nominal.scenario.control.hold_limit_s
-        return not self.along or (bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit)
+        return not self.along or (
+            bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit
+        )
 
     @property
     def roll_sd(self) -> float:
@@ -422,7 +446,8 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
 def planned_shapes(task: Task, state: State) -> Floats:
     """Return the poses (m, n, 5) of the needle along the plan, of the scenario's model."""
     rows = task.plan.controls[None]
-    return task.simulator.rollout(state, rows, outputs=("shapes",), limits=False).shapes[0]
+    shapes: Floats = task.simulator.rollout(state, rows, outputs=("shapes",), limits=False).shapes[0]
+    return shapes
 
 
 def low_pass(settings: Priors, left: Laterals) -> complex:

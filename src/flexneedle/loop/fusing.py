@@ -65,13 +65,17 @@ def _read_sensor(
     return replace(monitor, excluded=verdict), state
 
 
-def check_uncertain(scenario: Scenario, estimate: Any, states: Sequence[SensorState], tracker: str) -> Verdict:
+def check_uncertain(
+    scenario: Scenario, estimate: Any, states: Sequence[SensorState], tracker: str
+) -> Verdict:
     """Require a tip that is known well enough, by all sensors together; tracker: its verdict in words."""
     sd, limit = tip_sd(estimate), scenario.control.tip_sd_limit
     if sd <= limit:
         return OK
     states_of = [f"{one.name}: {one.verdict}" for one in states]
-    reason = f"known to ± {sd:.2f} mm across, limit {limit:.2f} mm (tracker: {tracker}; {'; '.join(states_of)})"
+    reason = (
+        f"known to ± {sd:.2f} mm across, limit {limit:.2f} mm (tracker: {tracker}; {'; '.join(states_of)})"
+    )
     return Verdict(VerdictKind.UNCERTAIN, reason)
 
 

@@ -30,7 +30,7 @@ class Observation:
     measurement: Measurement = _NO_MEASUREMENT
     verdict: Verdict = OK
     field: bool = False
-    watch: Watch = Watch()
+    watch: Watch = field(default_factory=Watch)
     sensors: tuple[SensorState, ...] = ()
 
     def has_good_reading_after(self, time: float) -> bool:

@@ -59,4 +59,6 @@ def check_frozen(state: SensorMonitor, depth: float, travel_limit: float, resolu
     travel = abs(depth - state.since)
     if resolution > 0.0 or state.repeats < _REPEATS or travel <= travel_limit:
         return OK
-    return Verdict(VerdictKind.FROZEN, f"{state.repeats} identical readings while the tip travelled {travel:.1f} mm")
+    return Verdict(
+        VerdictKind.FROZEN, f"{state.repeats} identical readings while the tip travelled {travel:.1f} mm"
+    )

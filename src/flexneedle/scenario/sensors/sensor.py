@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
+
 class Fault(Section):
     """Table `phantom.fault` of a `[[sensor]]`: a fault of the virtual sensor."""
 
@@ -177,18 +178,24 @@ def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
         return np.full(size, np.nan)
     values: Floats = np.array(rows)[:, :axes].ravel()
     if values.size != size:
-        raise ValueError(f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}")
+        raise ValueError(
+            f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}"
+        )
     return values
 
 
 def turn(values: "Floats", facing: Any, axes: int) -> "Floats":
     """Return values (m, d), lateral pairs in space, turned by unit numbers (m,) or (): by their cosine in the plane."""
     if axes == 1:
-        return values * np.asarray(facing).real[..., None]
+        flat: Floats = values * np.asarray(facing).real[..., None]
+        return flat
     pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.asarray(facing)[..., None]
-    return np.stack([pairs.real, pairs.imag], axis=-1).reshape(values.shape)
+    turned: Floats = np.stack([pairs.real, pairs.imag], axis=-1).reshape(values.shape)
+    return turned
 
 
 def perturbed(values: Sequence[float], most: float, rng: np.random.Generator) -> list[float]:
     """Return values, each displaced by up to ±most."""
-    return (np.asarray(values) + rng.uniform(-most, most, len(values))).tolist()
+    return [
+        value + float(off) for value, off in zip(values, rng.uniform(-most, most, len(values)), strict=True)
+    ]
