@@ -19,6 +19,8 @@ import numpy as np
 
 import flexneedle
 from flexneedle.errors import FlexneedleError
+from flexneedle.loop.virtual import Seeds
+from flexneedle.phantom.draw import draw
 from flexneedle.scenario.worlds import world
 
 BIAS_MM = 2.7
@@ -69,6 +71,19 @@ _GROWS = {"phantom.tracker_drift_mm": BIAS_MM, **_HOMED}
 _DECLARED = {"tracker.field_sd_mm": 2.0}
 
 
+def _fault(scenario: Any, rng: np.random.Generator, kind: str, size: float) -> dict[str, Any]:
+    """Return the keys of a sensor with a fault, which begins between a fifth and a half of the way."""
+    depth = float(rng.uniform(0.2, 0.5)) * scenario.target.depth_mm
+    return {"phantom": {"fault": {"kind": kind, "depth_mm": depth, "size": size}}}
+
+
+def faulty_slices(scenario: Any, rng: np.random.Generator, kind: str, size: float) -> list[dict[str, Any]]:
+    """Return two image planes, the first of which has a fault."""
+    first, second = slices(scenario, rng)
+    first["plane_mm"] = 0.1 * scenario.target.depth_mm
+    return [{**first, **_fault(scenario, rng, kind, size)}, second]
+
+
 def _lost(scenario: Any) -> dict[str, Any]:
     return {"phantom.tracker_lost_mm": 0.5 * scenario.target.depth_mm}
 
@@ -85,6 +100,22 @@ ROWS = (
     Row("lost", lambda s, r: _lost(s)),
     Row("lost, fbg", lambda s, r: {"sensor": [fbg(s, r)], **_lost(s)}),
     Row("lost, slices", lambda s, r: {"sensor": slices(s, r), **_lost(s)}),
+    *(
+        Row(
+            f"fbg {kind}",
+            lambda s, r, kind=kind, size=size: {"sensor": [fbg(s, r, **_fault(s, r, kind, size))]},
+            (True,),
+        )
+        for kind, size in (("drift", 0.4), ("frozen", 1.0), ("outliers", 0.3), ("delayed", 0.1))
+    ),
+    *(
+        Row(
+            f"slices {kind}",
+            lambda s, r, kind=kind, size=size: {"sensor": faulty_slices(s, r, kind, size)},
+            (True,),
+        )
+        for kind, size in (("drift", 0.4), ("frozen", 1.0))
+    ),
     Row("fbg alone", lambda s, r: {"sensor": [fbg(s, r)], "tracker.enabled": False, **_HOMED}, (True,)),
 )
 
@@ -97,8 +128,20 @@ def run_case(number: int, guided: bool, name: str) -> dict[str, Any]:
     rng = np.random.default_rng([44, number])
     plan = flexneedle.plan(scenario, seed=0, threads=1)
     changed = scenario.with_values(row.changes(scenario, rng))
-    insertion = flexneedle.insert(changed, plan, seed=number, threads=1, force=False)
-    return {"row": name, "world": number, "guided": guided, **measure(insertion, plan)}
+    estimates: list[Any] = []
+    insertion = flexneedle.insert(
+        changed,
+        plan,
+        seed=number,
+        threads=1,
+        listeners=[
+            lambda event: estimates.append(event.estimate) if isinstance(event, flexneedle.Decided) else None
+        ],
+    )
+    truth = draw(changed, np.random.default_rng(Seeds.of(number).phantom)).scenario.needle.bevel.offset_mm
+    true = truth / scenario.needle.bevel.offset_mm
+    bevel = abs(float(estimates[-1].parameters[estimates[-1].slots.bevel]) - true) if estimates else math.nan
+    return {"row": name, "world": number, "guided": guided, "bevel": bevel, **measure(insertion, plan)}
 
 
 def measure(insertion: Any, plan: Any) -> dict[str, Any]:
@@ -111,6 +154,13 @@ def measure(insertion: Any, plan: Any) -> dict[str, Any]:
     end = np.subtract(last.true_tip.point, plan.target)
     sd = last.tip_covariance
     across = np.nan if sd is None else float(off[-1] @ np.linalg.pinv(np.array(sd)[1:, 1:]) @ off[-1])
+    excluded = {}
+    for one in periods:
+        for state in one.sensors:
+            if not state.verdict.ok:
+                excluded.setdefault(state.name, one.true_tip.x)
+    fault = next((one.phantom.fault for one in insertion.scenario.sensor if one.phantom.fault), None)
+    late = math.nan if fault is None else min(excluded.values(), default=math.inf) - fault.depth_mm
     spent = np.array([1e3 * one.durations["observe"] for one in periods])
     return {
         "outcome": str(insertion.outcome),
@@ -120,6 +170,8 @@ def measure(insertion: Any, plan: Any) -> dict[str, Any]:
         "rms_early": float(np.sqrt(np.mean(np.sum(off[early] ** 2, axis=1)))) if early.any() else np.nan,
         "nees": across,
         "depth": float(depth[-1]),
+        "excluded": len(excluded),
+        "late_mm": late,
         "worst": float(np.hypot(*off.T).max()),
         "observe_ms": float(np.median(spent)),
         "observe_99": float(np.percentile(spent, 99)),
@@ -140,9 +192,8 @@ def _worlds(first: int, count: int, guided: bool) -> Iterator[int]:
 
 def table(results: list[dict[str, Any]]) -> str:
     """Return the table of all rows."""
-    lines = [
-        f"{'row':22}{'':10}{'n':>4}{'held':>6}{'miss':>8}{'95 %':>8}{'off':>8}{'95 %':>8}{'early':>8}{'in 95 %':>9}{'ms':>7}"
-    ]
+    head = f"{'row':22}{'':10}{'n':>4}{'held':>6}{'miss':>8}{'95 %':>8}{'off':>8}{'95 %':>8}{'early':>8}{'in 95 %':>9}"
+    lines = [head + f"{'ms':>7}{'excluded':>9}{'12 mm':>7}{'bevel':>8}"]
     for row in ROWS:
         for guided in (True, False):
             mine = [one for one in results if one["row"] == row.name and one["guided"] == guided]
@@ -159,11 +210,14 @@ def table(results: list[dict[str, Any]]) -> str:
                 for statistic in (np.median, lambda v: np.percentile(v, 95))
                 if done
             ] or [np.nan] * 4
+            found = np.mean([one["late_mm"] <= 12.0 for one in mine])
             early = np.median([one["rms_early"] for one in mine])
             lines.append(
                 f"{row.name:22}{'guided' if guided else 'unguided':10}{len(mine):4}{len(mine) - len(done):6}"
                 + "".join(f"{value:8.3f}" for value in (*values, early))
                 + f"{inside:9.2f}{np.median([one['observe_ms'] for one in mine]):7.1f}"
+                + f"{np.mean([one['excluded'] > 0 for one in mine]):9.2f}{found:7.2f}"
+                + f"{np.median([one['bevel'] for one in mine]):8.3f}"
             )
     return "\n".join(lines)
 

@@ -135,10 +135,9 @@ class SensorFit:
         """Return the sensor whose readings from a time (s) on do not count."""
         return replace(self, used=self.used & (self.time < since))
 
-    def parameter(self, parameters: Floats, name: str) -> float:
-        """Return turn or clock error of parameters (K,); 0 where it is not estimated."""
-        place: int | None = getattr(self.slots, name)
-        return 0.0 if place is None else parameters[place : place + 1].sum()
+    def clock(self, parameters: Floats) -> float:
+        """Return the clock error (s) of parameters (K,); 0 where it is not estimated."""
+        return 0.0 if self.slots.clock is None else parameters.item(self.slots.clock)
 
     @cached_property
     def _known(self) -> tuple[Floats, Floats]:
@@ -190,7 +189,7 @@ class SensorFit:
 
         ends (m + 1, d, 1 + p): `quantities` at the ends of the moves.
         """
-        index, part, angle = line.at(time - self.parameter(parameters, "clock"))
+        index, part, angle = line.at(time - self.clock(parameters))
         ends = self.placed(ends, parameters)
         level = (1.0 - part)[:, None] * ends[index] + part[:, None] * ends[index + 1]
         return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + self._errors(

@@ -33,9 +33,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     The step is shortened until the cost does not rise.
     """
     prior = fitted.prior
-    jacobian = jacobian_of(fitted)
-    both = zip(fitted.variances(), fitted.readings, fitted.laterals, strict=True)
-    variance = np.concatenate([noise + readings.estimate_sag(tips) ** 2 for noise, readings, tips in both])
+    jacobian, variance = jacobian_of(fitted), variance_of_rows(fitted)
     left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
     whitening = Whitening.of(fitted, variance) if fitted.field_sd else None
     if whitening:
@@ -54,10 +52,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
 
     def cost(other: FittedInsertion) -> float:
-        left = np.concatenate(other.residuals)
-        squares = np.abs(whitening.of_rows(left) if whitening else left) ** 2
-        own = float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
-        return own + cost_along(other) if other.along else own
+        return cost_of(other, variance, whitening)
 
     most = cost(fitted)
 
@@ -73,6 +68,20 @@ def improve_fit(fitted: Fitted) -> Fitted:
         if not is_worse(trial):
             break
     return differentiate(trial)
+
+
+def variance_of_rows(fitted: FittedInsertion) -> Floats:
+    """Return the variances (r,) of the rows of the tip's sensors."""
+    both = zip(fitted.variances(), fitted.readings, fitted.laterals, strict=True)
+    return np.concatenate([noise + readings.estimate_sag(tips) ** 2 for noise, readings, tips in both])
+
+
+def cost_of(fitted: FittedInsertion, variance: Floats, whitening: "Whitening | None") -> float:
+    """Return the negative logarithm of the posterior density, up to a constant, with variances of the tip's rows."""
+    left = np.concatenate(fitted.residuals)
+    squares = np.abs(whitening.of_rows(left) if whitening else left) ** 2
+    own = float(0.5 * (squares / variance).sum()) + fitted.prior.cost(fitted.parameters)
+    return own + cost_along(fitted) if fitted.along else own
 
 
 def step_within(precision: Floats, gradient: Floats, bounds: Floats) -> Floats:

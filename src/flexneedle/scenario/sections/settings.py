@@ -116,8 +116,8 @@ class ControlSettings(Section):
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
     """Probability of a miss beyond `miss_limit_mm` from which the needle is held."""
     tip_sd_limit_mm: Positive | None = None
-    """Standard deviation of the estimated tip across the needle from which it is held, with a `[[sensor]]`. Not set: half
-    of `miss_limit_mm`."""
+    """Standard deviation of the estimated tip across the needle from which it is held, with a `[[sensor]]`. Not set:
+    half of `miss_limit_mm`."""
     hold_limit_s: Positive = 1.0
     """Time without a valid reading, or without a path to the target, after which the insertion ends."""
     hold_total_s: Positive = 300.0

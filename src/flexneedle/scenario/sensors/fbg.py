@@ -1,5 +1,6 @@
 """Fibre Bragg gratings along the needle: curvature at sites, in the frame that rolls with the needle."""
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
@@ -59,7 +60,7 @@ class Fbg(Sensor):
     @field_validator("sites_mm")
     @classmethod
     def _rise(cls, sites: tuple[float, ...]) -> tuple[float, ...]:
-        if any(later <= earlier for earlier, later in zip(sites, sites[1:], strict=False)):
+        if any(later <= earlier for earlier, later in pairwise(sites)):
             raise ValueError("must rise, from the tip on")
         return sites
 

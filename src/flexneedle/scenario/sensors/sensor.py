@@ -4,9 +4,9 @@ A kind says what an error-free sensor measures on a needle, and how large the er
 
     (1 + g) e^(i(ρ − φ)) (q + q' p) + o + w + ε
 
-with the quantity q of the needle, its derivative q' to the places p of the sensor, gain error g, turn ρ, offset o, wander
-w (correlated over time) and white noise ε; φ is the angle of the needle for a sensor that rolls with it, else 0. Units
-of values are those that the kind chooses, the same in all of its methods.
+with the quantity q of the needle, its derivative q' to the places p of the sensor, gain error g, turn ρ, offset o,
+wander w (correlated over time) and white noise ε; φ is the angle of the needle for a sensor that rolls with it, else 0.
+Units of values are those that the kind chooses, the same in all of its methods.
 """
 
 from collections.abc import Sequence
@@ -147,7 +147,7 @@ class Sensor(Section):
         """Return standard deviations (d,) of the model's error in the mean of a move; planned (m, d): along a plan."""
         raise NotImplementedError
 
-    def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
+    def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":  # noqa: ARG002
         """Return the values (d,) of a reading, NaN where it has none; needle: as predicted at its time (m = 1).
 
         Raises ValueError, with the rule, for rows of another shape.
