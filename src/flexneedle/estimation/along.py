@@ -137,7 +137,8 @@ class SensorFit:
 
     def clock(self, parameters: Floats) -> float:
         """Return the clock error (s) of parameters (K,); 0 where it is not estimated."""
-        return 0.0 if self.slots.clock is None else parameters.item(self.slots.clock)
+        place = self.slots.clock
+        return 0.0 if place is None else float(parameters[place : place + 1].sum())
 
     @cached_property
     def _known(self) -> tuple[Floats, Floats]:
@@ -213,7 +214,9 @@ class SensorFit:
         begins = np.append(0.0, self.depths[:-1])
         ramps = np.clip((depth[:, None] - begins) / (self.depths - begins), 0.0, 1.0)
         units = np.tile(np.eye(width), (size // width, 1))
-        spread: Floats = np.einsum("bk,dc->bdkc", ramps, units).reshape(len(depth), size, -1)
+        spread: Floats = np.einsum("bk,dc->bdkc", ramps, units).reshape(
+            len(depth), size, len(self.depths) * width
+        )
         return spread
 
     def variances(self, bins: Bins) -> Floats:

@@ -70,7 +70,7 @@ _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
 TRACKER = "tracker"
 """Name of the tracker among the sensors."""
-_REFITS = 3  # steps of the fit after a sensor is excluded
+_REFITS = 4  # steps of the fit after a sensor is excluded
 _KNOTS = 3  # of a drift, down to the target
 _RECENT = 12  # moves whose residuals are low-passed
 

@@ -22,8 +22,8 @@ from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, Measurement, SensorState, Verdict, VerdictKind, X
 
 _STEPS = 12  # of the largest advance: readings of which are left out
-_GAIN = 12.0  # least fall of the cost of the fit without a faulty sensor
-_CLEAR = 5.0  # by which it must fall more than without any other sensor
+_GAIN = 40.0  # least fall of the cost of the fit without the last readings of a faulty sensor
+_CLEAR = 2.0  # ratio of the misfits of the others
 _OUTLYING = 0.5  # share of outliers in a period, which are no chance
 
 
@@ -114,25 +114,50 @@ def exclude_faulty(
     active = [name for name in names if watch.of(name).excluded.ok and estimate.count_values(name, since)]
     if not any(watch.of(name).suspicious for name in active):
         return estimate, watch, tuple(states), OK
-    now = estimate.cost
-    fits = {name: estimate.without(name, since) for name in active}
-    gains = {name: now - fits[name].cost - 0.5 * estimate.count_values(name, since) for name in active}
-    first, *others = sorted(active, key=lambda name: -gains[name])
-    if gains[first] < _GAIN:
+    first, clear = _find_faulty(estimate, active, since)
+    if not first:
         return estimate, watch, tuple(states), OK
-    if others and gains[first] - gains[others[0]] < _CLEAR:
-        reason = f"{first} and {others[0]} contradict each other"
-        return estimate, watch, tuple(states), Verdict(VerdictKind.CONTRADICTED, reason)
-    nis = watch.of(first).nis
-    reason = f"innovations {math.sqrt(sum(nis) / max(1, len(nis))):.1f} times their standard deviation"
+    reason = f"its innovations are {math.sqrt(watch.of(first).level):.1f} times their standard deviation"
+    if first == TRACKER or not clear:
+        reason = f"{reason}, by the other sensors" if clear else "the sensors contradict each other"
+        verdict = Verdict(VerdictKind.CONTRADICTED, f"{first}: {reason}")
+        return (
+            estimate,
+            watch.change(TRACKER, replace(watch.of(TRACKER), excluded=verdict)),
+            tuple(states),
+            verdict,
+        )
     verdict = Verdict(VerdictKind.CONTRADICTED, reason)
-    watch = watch.change(first, replace(watch.of(first), excluded=verdict))
-    if first == TRACKER:
-        held = Verdict(VerdictKind.CONTRADICTED, f"tracker: {reason}, by the other sensors")
-        return fits[first], watch, tuple(states), held
     after = tuple(replace(one, verdict=verdict) if one.name == first else one for one in states)
-    cleared = {name: replace(watch.of(name), nis=()) for name in active if name != first}
-    return fits[first], Watch({**watch.monitors, **cleared}), after, OK
+    monitors = {name: replace(watch.of(name), nis=()) for name in active}
+    monitors[first] = replace(watch.of(first), excluded=verdict)
+    return estimate.without(first, since), Watch({**watch.monitors, **monitors}), after, OK
+
+
+def _find_faulty(estimate: Any, active: Sequence[str], since: float) -> tuple[str, bool]:
+    """Return the sensor without which the others agree best, and True if it is clear; "" if no fault explains more.
+
+    The last readings of a faulty sensor, from `since` (s) on, cost far more than a reading's share. Which sensor it is, is
+    told by the fits without each of them in the tissue: what is left agrees only without the faulty one.
+    """
+    counts = {name: estimate.count_values(name, since) for name in active}
+    gains = [estimate.cost - estimate.without(name, since).cost - 0.5 * counts[name] for name in active]
+    if max(gains) < _GAIN:
+        return "", False
+    entry = _time_of_entry(estimate)
+    whole = {name: estimate.count_values(name, entry) for name in active}
+    misfits = {}
+    for name in active:
+        others = sum(whole.values()) - whole[name]
+        misfits[name] = estimate.without(name, entry).cost / others if others else 0.0
+    first, *others = sorted(active, key=lambda name: misfits[name])
+    return first, not others or misfits[others[0]] > _CLEAR * misfits[first]
+
+
+def _time_of_entry(estimate: Any) -> float:
+    """Return the time (s) at which the tip entered the tissue."""
+    inside = np.flatnonzero(estimate.tips[1:, X] > 0.0)
+    return float(estimate.moves[inside[0] if inside.size else -1].motion.begun)
 
 
 def _time_of_depth(estimate: Any, scenario: Scenario) -> float:

@@ -8,6 +8,7 @@ their predictions than both errors allow for may be faulty; then the fit decides
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from flexneedle.types import OK, VISIBLE, CheckedReading, Floats, Reading, Verdi
 _OUTLIER_SDS = 6.0
 _REPEATS = 10
 _WINDOW = 8  # periods
-_SUSPICIOUS = 2.0  # mean normalised square of the innovation
+_SUSPICIOUS = 1.7  # median of the normalised squares of the innovations: one surprise is none
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,12 @@ class SensorMonitor:
     @property
     def suspicious(self) -> bool:
         """True if the last innovations are improbably large."""
-        return len(self.nis) == _WINDOW and sum(self.nis) > _WINDOW * _SUSPICIOUS
+        return len(self.nis) == _WINDOW and self.level > _SUSPICIOUS
+
+    @property
+    def level(self) -> float:
+        """Median of the normalised squares of the last innovations."""
+        return median(self.nis) if self.nis else 0.0
 
     def check_frozen(self, depth: float, travel_limit: float, resolution: float) -> Verdict:
         """Refuse readings that repeat while the tip travels, unless the sensor's values have steps."""
