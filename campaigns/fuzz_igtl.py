@@ -41,7 +41,9 @@ from flexneedle.lab.igtl.messages import (
     TransformMessage,
 )
 from flexneedle.lab.igtl.requests import read_request
+from flexneedle.lab.igtl.sensor import IgtlSensorSettings, PointsReader
 from flexneedle.lab.igtl.tracker import IgtlTrackerSettings, TransformReader
+from flexneedle.scenario.sensors.points import Points
 from fuzzing import ODD, Failure, main, mutate
 
 SLOWEST_S = 1.0
@@ -136,13 +138,15 @@ def problem(one: Received) -> str:
 
 
 def use(one: Received) -> None:
-    """Read a message as an insertion does, which may refuse it, and as a tracker of its device does."""
+    """Read a message as an insertion does, which may refuse it, and as a tracker and a sensor of its device do."""
     if isinstance(one, Query | Skipped):
         return
     with suppress(InputError):
         read_request(one, one.name)
     settings = IgtlTrackerSettings.model_construct(device=one.name, axis="x", stamps=True)
     TransformReader(settings).read(one, "peer", 0.0, False)
+    sensor = IgtlSensorSettings.model_construct(device=one.name)
+    PointsReader(sensor, Points(kind="points", to_mm=50.0), None).read(one, "peer", 0.0, False)
 
 
 def decoder(random: Random) -> Iterator[str]:

@@ -26,15 +26,17 @@ import rosbags.typesys.stores.ros2_humble as ros
 from flexneedle.errors import DriverError
 from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
 from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.fbg.mounting import MountingSettings, SiteMap
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.frames import FARTHEST_MM
 from flexneedle.lab.ros.motors import JointLink, RosMotors
 from flexneedle.lab.ros.parsing import Subscription
-from flexneedle.lab.ros.profile import SUBSCRIBED, load_profile
+from flexneedle.lab.ros.profile import CURVATURES, POINT, SHAPE, SUBSCRIBED, load_profile
 from flexneedle.lab.ros.records import JointReading, Received, TipReading
+from flexneedle.lab.ros.sensor import RosFbg, RosSensor
 from flexneedle.lab.ros.tracker import RosTracker
 from flexneedle.record.messages import STORE
-from flexneedle.types import VISIBLE
+from flexneedle.types import VISIBLE, Reading
 from fuzzing import Failure, main
 
 SLOWEST_S = 1.0
@@ -78,7 +80,7 @@ def damage(rng: np.random.Generator, key: str) -> bytes:
 def valid(rng: np.random.Generator, key: str) -> bytes:
     """A message that can be read, with odd contents."""
     message = MESSAGES[key](rng)
-    return bytes(STORE.serialize_cdr(message, SUBSCRIBED[key], little_endian=bool(rng.random() < 0.9)))
+    return bytes(STORE.serialize_cdr(message, TYPES[key], little_endian=bool(rng.random() < 0.9)))
 
 
 def _number(rng: np.random.Generator) -> float:
@@ -108,6 +110,14 @@ def _shape(rng: np.random.Generator) -> ros.geometry_msgs__msg__PoseArray:
     return ros.geometry_msgs__msg__PoseArray(_header(rng), [_pose(rng) for _ in range(count)])
 
 
+def _curvatures(rng: np.random.Generator) -> ros.std_msgs__msg__Float64MultiArray:
+    count = int(rng.choice((0, 1, 4, 6, 36)))
+    sizes = rng.choice((0, 2, 3, 16, 24, 2**32 - 1), size=int(rng.choice((0, 0, 1, 2, 2, 3))))
+    dimensions = [ros.std_msgs__msg__MultiArrayDimension("x", int(size), 8) for size in sizes]
+    layout = ros.std_msgs__msg__MultiArrayLayout(dimensions, int(rng.random() < 0.1))
+    return ros.std_msgs__msg__Float64MultiArray(layout, np.array([_number(rng) for _ in range(count)]))
+
+
 def _joints(rng: np.random.Generator) -> ros.sensor_msgs__msg__JointState:
     counts = rng.integers(0, 5, size=4) if rng.random() < 0.3 else [int(rng.integers(1, 5))] * 4
     names = [str(name) for name in rng.choice(("a", "b", "c", "d", *TEXTS), size=counts[0])]
@@ -129,6 +139,18 @@ MESSAGES = {
     "stop": _flag,
     "arm": _flag,
     "joint_states": _joints,
+}
+MESSAGES |= {
+    "sensors.curvatures": _curvatures,
+    "sensors.shape": _shape,
+    "sensors.points": _shape,
+    "sensors.crossing": MESSAGES["target"],
+}
+TYPES = SUBSCRIBED | {
+    "sensors.curvatures": CURVATURES,
+    "sensors.shape": SHAPE,
+    "sensors.points": SHAPE,
+    "sensors.crossing": POINT,
 }
 KINDS: dict[str, Bytes] = {"random": random_bytes, "damaged": damage, "valid": valid}
 
@@ -159,6 +181,12 @@ def problem(key: str, data: bytes, record: Received | None) -> str:
             return _far([position] if position else []) or ("" if unit else f"orientation {turn}")
         case JointReading(positions=positions):
             return "" if positions else "no joint"
+        case Reading(rows=rows, status=status):
+            if bool(rows) is (status != VISIBLE):
+                return f"{len(rows)} rows, status {status}"
+            return (
+                "" if key == "sensors.curvatures" else _far([row for row in rows if not math.isnan(row[0])])
+            )
     return f"a record of type {type(record).__name__}"
 
 
@@ -170,7 +198,7 @@ def _far(points: Iterable[Sequence[float]]) -> str:
 class SilentNode:
     """In place of a node: hands out records, and keeps what would be published."""
 
-    status = VISIBLE
+    status, obstacles = VISIBLE, dict[str, str]()
 
     def __init__(self) -> None:
         self.records: list[Received] = []
@@ -187,10 +215,15 @@ class SilentNode:
 
 
 class Consumers:
-    """Driver and tracker on one silent node each."""
+    """Driver, tracker and sensors on one silent node each."""
 
     def __init__(self) -> None:
-        self.nodes = SilentNode(), SilentNode()
+        self.nodes = SilentNode(), SilentNode(), SilentNode(), SilentNode()
+        sites = SiteMap((30.0, 20.0, 10.0), (15.0, 30.0), MountingSettings())
+        self.sensors = (
+            RosSensor(self.nodes[2], WallClock(), 0.25, "sensors.shape"),
+            RosFbg(self.nodes[3], WallClock(), 0.25, "sensors.curvatures", sites, 0.02),
+        )
         self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)
         link = JointLink.__new__(JointLink)
         vars(link).update(
@@ -213,6 +246,10 @@ class Consumers:
         for frame in self.tracker.read():
             if not math.isfinite(frame.time):
                 return f"a frame at {frame.time} s"
+        for sensor in self.sensors:
+            if not all(math.isfinite(reading.time) for reading in sensor.read()):
+                return "a reading without a time"
+            _ = sensor.status
         _ = self.tracker.status
         try:
             states = self.motors.read()
@@ -247,15 +284,14 @@ def messages(random: Random) -> Iterator[str]:
 def _subscriptions() -> Iterator[Subscription]:
     for name in PROFILES:
         profile = load_profile(name)
-        for key in SUBSCRIBED:
-            if getattr(profile.subscribe, key) is not None:
-                yield Subscription(profile, key)
+        for key in profile.read_topics:
+            yield Subscription(profile, key)
 
 
 def _take(consumers: Consumers, subscription: Subscription, data: bytes) -> str:
     """Return the type of the record of a message. Raises Failure."""
     try:
-        record = subscription.read(data, time.monotonic())
+        record = subscription.read(data, time.monotonic(), sent=time.time())
         found = problem(subscription.key, data, record)
         if record is not None and not found:
             found = consumers.take(record)
@@ -275,12 +311,12 @@ def live(random: Random) -> Iterator[str]:
     profile, rng = load_profile("neutral"), np.random.default_rng(random.getrandbits(64))
     domain = join_domain()
     with NodeClient(profile) as node:
-        topics = {key: getattr(profile.subscribe, key).topic for key in SUBSCRIBED}
-        writers = {key: TopicWriter(domain, topic, SUBSCRIBED[key]) for key, topic in topics.items()}
+        topics = profile.read_topics
+        writers = {key: TopicWriter(domain, topic.topic, kind) for key, (topic, kind) in topics.items()}
         if not _within(20.0, lambda: all(writer.readers for writer in writers.values())):
             raise Failure("the node was not found")
         for count in itertools.count(1):
-            key = str(rng.choice([key for key in SUBSCRIBED if key != "stop"]))
+            key = str(rng.choice([key for key in topics if key != "stop"]))
             data = KINDS[str(rng.choice(list(KINDS)))](rng, key)
             if key == "arm" and data[HEADER_BYTES : HEADER_BYTES + 1] not in (b"", FALSE):
                 continue  # true: Cyclone DDS hands on any other byte as 1

@@ -336,7 +336,7 @@ class TestRosTracker(InSimulatedTime):
         self.monkeypatch = monkeypatch
 
     def make(self, clock):
-        self.monkeypatch.setattr("flexneedle.lab.ros.tracker.monotonic", clock.now)
+        self.monkeypatch.setattr("flexneedle.lab.ros.receiver.monotonic", clock.now)
         self.node = TipNode(clock)
         return RosTracker(self.node, clock, late_s=0.25)
 

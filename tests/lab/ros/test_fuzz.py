@@ -8,6 +8,7 @@ import pytest
 
 from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
 from flexneedle.lab.ros.records import JointReading, TipReading
+from flexneedle.types import Reading
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "campaigns"))
 import fuzz_ros
@@ -23,6 +24,7 @@ def test_any_bytes_may_be_received():
         "LinkRefusal",
         "LinkStop",
         "LinkTarget",
+        "Reading",
         "TipReading",
     }
 
@@ -44,6 +46,8 @@ def test_a_node_survives_any_bytes_and_still_forwards_a_stop():
         ("tip", TipReading(0.0, 1, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0)), "orientation"),
         ("tip", LinkRefusal(0.0, "/t", "two\nlines"), "reason"),
         ("joint_states", JointReading(0.0, {}), "no joint"),
+        ("sensors.shape", Reading(0.0, ()), "0 rows, status ok"),
+        ("sensors.shape", Reading(0.0, ((2e4, 0.0, 0.0),)), "position"),
     ],
 )
 def test_wrong_records_are_found(key, record, found):

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import z_axis
 from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
+from flexneedle.lab.link.sensing import MOST_POINTS
 from flexneedle.lab.link.stamps import StampClock
-from flexneedle.lab.ros.parsing import LARGEST_BYTES, MOST_POSES, Subscription
+from flexneedle.lab.ros.parsing import LARGEST_BYTES, Subscription
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.records import JointReading, TipReading
 from flexneedle.types import VISIBLE
@@ -115,7 +116,7 @@ def without_a_position():
         ("target", target(5.0, (40.0, 0.0, 0.0)), "position (40, 0, 0)"),
         ("target", target(5.0, (0.0, 0.0, math.inf)), "position (0, 0, inf)"),
         ("shape", shape(5.0, []), "0 poses: must be 1 to 10000"),
-        ("shape", shape(5.0, [(0.0, 0.0, 0.0)] * (MOST_POSES + 1)), "10001 poses"),
+        ("shape", shape(5.0, [(0.0, 0.0, 0.0)] * (MOST_POINTS + 1)), "10001 poses"),
         ("joint_states", joints(5.0, {}), "0 joints"),
         ("joint_states", with_twice_the_name(), "2 joints: must be 1 to 1000, each once"),
         ("joint_states", without_a_position(), "2 names, 1 positions: must be as many"),

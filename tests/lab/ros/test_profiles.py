@@ -10,15 +10,17 @@ import tomli_w
 from flexneedle.errors import RigError
 from flexneedle.lab.ros import profile as profiles
 from flexneedle.lab.ros.profile import (
+    CURVATURES,
     INSERTION_KEYS,
     PROFILES,
     PUBLISHED,
+    SHAPE,
     SUBSCRIBED,
     TopicProfile,
     load_profile,
 )
 
-TOPIC, SHAPE = {"topic": "/t", "frame": "skin"}, "/flexneedle/needle/shape"
+TOPIC, NEEDLE = {"topic": "/t", "frame": "skin"}, "/flexneedle/needle/shape"
 NAMES = ["neutral", "smartneedle", "smartneedle-fbg"]
 SMARTNEEDLE = {
     "publish.shape": ("/needle/state/current_shape", "geometry_msgs/msg/PoseArray", "mm"),
@@ -33,6 +35,10 @@ SMARTNEEDLE = {
 def kind_of(key):
     section, _, name = key.partition(".")
     return {"publish": PUBLISHED, "subscribe": SUBSCRIBED}[section][name]
+
+
+def without_sensors(topics):
+    return {key: topic for key, topic in topics.items() if not key.startswith("sensors.")}
 
 
 def topics_of(name):
@@ -56,19 +62,21 @@ def test_every_shipped_topic_has_a_type_and_one_owner():
     assert sorted(path.stem for path in paths) == PROFILES.names() == NAMES
     for path in paths:
         topics = dict(TopicProfile.model_validate(tomllib.loads(path.read_text())).list_topics())
-        assert all(kind_of(key) for key in topics)
-        assert len({topic.topic for topic in topics.values()}) == len(topics)
+        assert all(kind_of(key) for key in without_sensors(topics))
+        assert len({topic.topic for topic in without_sensors(topics).values()}) == len(
+            without_sensors(topics)
+        )
     assert set(PUBLISHED) == set(profiles.PublishedTopics.model_fields)
     assert set(SUBSCRIBED) == set(profiles.ReadTopics.model_fields)
 
 
 def test_neutral_lists_all_topics_but_those_of_smartneedle_alone():
-    listed = topics_of("neutral")
+    listed = without_sensors(topics_of("neutral"))
     every = {f"publish.{key}" for key in PUBLISHED} | {f"subscribe.{key}" for key in SUBSCRIBED}
     assert every - set(listed) == {"publish.skin_entry", "publish.needle_pose", "publish.guide_pose"}
     assert all(getattr(topic, "unit", "m") == "m" for topic in listed.values())
     reduced = load_profile("neutral").select(**INSERTION_KEYS)  # measurements and motors have separate nodes
-    read = {key for key, _ in reduced.list_topics() if key.startswith("subscribe")}
+    read = {key for key, _ in reduced.list_topics() if not key.startswith("publish")}
     assert read == {"subscribe.stop", "subscribe.arm", "subscribe.target"}
     assert reduced.publish.joint_targets is None
     assert reduced.publish.shape == load_profile("neutral").publish.shape
@@ -107,7 +115,12 @@ def test_the_needle_is_turned_into_the_stage_as_in_that_system():
         ({"publish__tip": TOPIC | {"unit": "in"}}, 'publish.tip.unit = "in"'),
         ({"publish__tipp": TOPIC}, "publish.tipp = {…}"),
         ({"publish__shape": TOPIC | {"spacing_mm": 0.0}}, "publish.shape.spacing_mm = 0.0"),
-        ({"subscribe__shape": TOPIC | {"topic": SHAPE}}, f'subscribe.shape.topic = "{SHAPE}"'),
+        ({"subscribe__shape": TOPIC | {"topic": NEEDLE}}, f'subscribe.shape.topic = "{NEEDLE}"'),
+        ({"sensors__a": TOPIC}, "sensors.a.type: missing"),
+        ({"sensors__a": TOPIC | {"type": "std_msgs/msg/Bool"}}, 'sensors.a.type = "std_msgs/msg/Bool"'),
+        ({"sensors__a": TOPIC | {"type": CURVATURES}}, 'sensors.a.frame = "skin": curvatures have no'),
+        ({"sensors__a": TOPIC | {"type": SHAPE, "frame": ""}}, 'sensors.a.frame = ""'),
+        ({"sensors__a": TOPIC | {"type": SHAPE, "topic": NEEDLE}}, f'sensors.a.topic = "{NEEDLE}"'),
         ({"frames__skin": {"id": "skin", "x": "z"}}, 'frames.skin = ["z", "y", "z"]'),
         ({"frames__skin": {"id": "skin", "y": "-y"}}, 'frames.skin = ["x", "-y", "z"]'),
         ({"frames__skin": {"id": ""}}, "frames.skin.id"),

@@ -13,7 +13,8 @@ from flexneedle.lab.rig.rig_file import RigFile, check_settings
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.dds import join_domain
 from flexneedle.lab.ros.motors import RosDriverSettings
-from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, load_profile
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, SensorTopic, load_profile
+from flexneedle.lab.ros.sensor import RosFbgSettings
 from flexneedle.lab.ros.tracker import RosTrackerSettings
 from ros_topics_rig import rig_of_page
 
@@ -22,10 +23,11 @@ PAGE = (Path(__file__).parents[3] / "docs" / "rig" / "ros.md").read_text(encodin
 
 def row(key, topic, frames):
     section, _, name = key.partition(".")
-    kind = {"publish": PUBLISHED, "subscribe": SUBSCRIBED}[section][name]
-    verb = {"publish": "publishes", "subscribe": "reads"}[section]
+    listed = {"publish": PUBLISHED, "subscribe": SUBSCRIBED}
+    kind = topic.type if section == "sensors" else listed[section][name]
+    verb = {"publish": "publishes", "subscribe": "reads", "sensors": "sensor"}[section]
     latched = ", latched" if section == "publish" and name in LATCHED else ""
-    placed = f"{frames[topic.frame].id}|{topic.unit}" if hasattr(topic, "unit") else "|"
+    placed = f"{frames[topic.frame].id}|{topic.unit}" if getattr(topic, "frame", "") else "|"
     return f"|{verb} `{name}`{latched}|`{topic.topic}`|{kind}|{placed}|"
 
 
@@ -86,13 +88,19 @@ def first_column(key):
     section, _, name = key.partition(".")
     if section == "publish":
         return "published, latched" if name in LATCHED else "published"
-    rows = ("reads `stop`: three readers", "reads `target`, `arm`", "reads `tip`, `shape`, `joint_states`")
-    return next(row for row in rows if f"`{name}`" in row)
+    rows = (
+        "reads `stop`: three readers",
+        "reads `target`, `arm`",
+        "reads `tip`, `shape`, `joint_states`, sensors",
+    )
+    return next(row for row in rows if ("sensors" if section == "sensors" else f"`{name}`") in row)
 
 
 def test_qualities_of_service_agree_with_the_node():
     profile, page, domain = load_profile("neutral"), table_of_qualities(), join_domain()
-    kinds = {"publish": BuiltinTopicDcpsPublication, "subscribe": BuiltinTopicDcpsSubscription}
+    kinds = {"publish": BuiltinTopicDcpsPublication} | dict.fromkeys(
+        ("subscribe", "sensors"), BuiltinTopicDcpsSubscription
+    )
     with NodeClient(profile):
         for section, kind in kinds.items():
             wanted = {
@@ -102,6 +110,17 @@ def test_qualities_of_service_agree_with_the_node():
             }
             counts = {topic: len(qualities) for topic, qualities in wanted.items()}
             assert announced(domain, kind, counts) == wanted
+
+
+def test_the_sensor_and_its_profile_are_valid():
+    blocks = re.findall(r"```toml[^\n]*\n(\[.*?)```", PAGE, re.DOTALL)
+    (sensor,) = next(tomllib.loads(block)["sensor"] for block in blocks if "[[sensor]]" in block)
+    assert sensor.pop("kind") == "ros"
+    sensor.pop("name")
+    check_settings(RosFbgSettings, sensor)
+    (topic,) = next(tomllib.loads(block)["sensors"].values() for block in blocks if "[sensors." in block)
+    assert set(topic) == set(SensorTopic.model_fields) - {"order"}
+    SensorTopic.model_validate(topic)
 
 
 def test_the_rig_file_is_valid():

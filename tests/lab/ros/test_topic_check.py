@@ -63,7 +63,8 @@ def test_without_publishers_each_topic_is_listed_without_a_problem(monkeypatch):
     stop = ("/flexneedle/stop", "std_msgs/msg/Bool", "no", "no", "0.1", None)
     assert FOUND.fullmatch(found["stop"].found).groups() == stop
     assert found["tip"].found.endswith("; not used")
-    listed = "connection, other participants, tip, shape, target, stop, arm, joint_states"
+    sensors = "sensors.curvatures, sensors.shape, sensors.points, sensors.crossing"
+    listed = f"connection, other participants, tip, shape, target, stop, arm, joint_states, {sensors}"
     assert ", ".join(found) == listed
     assert not any(one.problem for one in found.values())
 

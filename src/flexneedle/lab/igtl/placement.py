@@ -73,18 +73,18 @@ def _place(
     registration = own or received.registration
     values = _image_values(registration) if own is None and registration is not None else {}
     if not received.has_points:
-        return Placement(values, (_describe_registration(own, received.registration),))
+        return Placement(values, (describe_registration(own, received.registration),))
     given = received.entry or earlier
     entry = (0.0, scenario.entry.lateral_mm, scenario.entry.lateral_z_mm)
     shown = ""
     if given is not None:
-        entry = _to_needle(scenario, registration, given)
+        entry = _to_scenario(scenario, registration, given)
         _check_entry(scenario, entry, entry_radius)
         shown = f"entry {'' if received.entry else 'received before '}{_to_text(entry)} mm"
     if received.target is None:
         return Placement({}, (f"{shown}, for the next target",))
     lines = [*_describe_image(scenario)] if values else []
-    target = _to_needle(scenario, registration, received.target)
+    target = _to_scenario(scenario, registration, received.target)
     values |= dict(zip(("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"), target, strict=True))
     if given is not None:
         values |= {"entry.lateral_mm": entry[1], "entry.lateral_z_mm": entry[2]}
@@ -105,7 +105,7 @@ def _image_values(registration: ImageRegistration) -> dict[str, Any]:
     }
 
 
-def _describe_registration(own: ImageRegistration | None, received: ImageRegistration | None) -> str:
+def describe_registration(own: ImageRegistration | None, received: ImageRegistration | None) -> str:
     """Return a line about a received registration. Raises InputError if it is not the scenario's."""
     if own is None or received is None:
         origin = (0.0, 0.0, 0.0) if received is None else received.translation
@@ -126,12 +126,17 @@ def _describe_image(scenario: Scenario) -> Iterator[str]:
         yield f"zones in files are placed by it: {', '.join(names)}"
 
 
-def _to_needle(scenario: Scenario, registration: ImageRegistration | None, point: Point) -> Point:
+def to_needle(registration: ImageRegistration | None, point: Point) -> Point:
     """Return a point of a peer (mm) in the needle's frame. Raises InputError for one farther than 10 m."""
     given = np.array(point)
     x, y, z = (given if registration is None else registration.apply(given)).tolist()
     if not math.hypot(x, y, z) <= FARTHEST_MM:
         raise InputError(f"point {_to_text(point)}: farther than 10 m")
+    return x, y, z
+
+
+def _to_scenario(scenario: Scenario, registration: ImageRegistration | None, point: Point) -> Point:
+    x, y, z = to_needle(registration, point)
     return x, y, 0.0 if scenario.setup.axes == 1 and abs(z) <= _ROUNDING_MM else z
 
 

@@ -29,7 +29,8 @@ def open_node(profile: TopicProfile, *, epoch: float = 0.0) -> "NodeClient":
 class NodeClient(LinkClient):
     """A node that publishes and reads all topics of a profile. Use it as a context manager, or call `close`.
 
-    subscribers, publishers: number of nodes of each topic, by key of `publish` and `subscribe`, at the last `poll`.
+    subscribers, publishers: number of nodes of each topic, by key of `publish` and `subscribe`, at the last `poll`;
+    obstacles: why a publisher of a sensor's topic is not received, by key.
     """
 
     droppable = (Period, JointTargets)
@@ -38,9 +39,11 @@ class NodeClient(LinkClient):
         check_installed()
         self.subscribers: Mapping[str, int] = {}
         self.publishers: Mapping[str, int] = {}
+        self.obstacles: Mapping[str, str] = {}
         super().__init__(f"{__package__}.node", NodeSetup(profile, epoch), "ROS")
 
     def _take_heartbeat(self, beat: Any) -> None:
         super()._take_heartbeat(beat)
         if isinstance(beat, RosHeartbeat):
             self.subscribers, self.publishers = beat.subscribers, beat.publishers
+            self.obstacles = beat.obstacles

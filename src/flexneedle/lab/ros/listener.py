@@ -3,17 +3,9 @@
 import time
 from dataclasses import dataclass, field
 
-from flexneedle.errors import make_printable
 from flexneedle.lab.link.records import LinkRefusal, LinkStop
-from flexneedle.lab.ros.dds import (
-    DomainDirectory,
-    TopicReader,
-    join_domain,
-    to_dds_name,
-    to_dds_topic,
-    to_ros_name,
-)
-from flexneedle.lab.ros.node import make_inputs
+from flexneedle.lab.ros.dds import DomainDirectory, TopicReader, join_domain, to_dds_topic
+from flexneedle.lab.ros.node import find_obstacle, make_inputs
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import TopicProfile
 from flexneedle.ports import Clock
@@ -23,7 +15,7 @@ _PAUSE_S = 0.01
 
 @dataclass(frozen=True)
 class TopicActivity:
-    """Activity on a topic of `subscribe`.
+    """Activity on a topic of `subscribe` or `sensors`.
 
     publishers, messages: their numbers; age: age (s) of the last message at the end, by the clocks of both computers,
     None without a message; problem: "" if there is none.
@@ -39,7 +31,7 @@ class TopicActivity:
 
 
 class TopicListener:
-    """Reads all topics of `subscribe` that a profile lists. Raises InputError or RunError as `join_domain`.
+    """Reads all topics of `subscribe` and `sensors` that a profile lists. Raises as `join_domain`.
 
     identity: the domain.
     """
@@ -89,7 +81,7 @@ class _Topic:
         for data, source in (sample for reader in self.readers for sample in reader.take()):
             if source not in self.sources:  # a stop has several readers
                 self.sources.add(source)
-                match self.subscription.read(data, now, publishers):
+                match self.subscription.read(data, now, publishers, 1e-9 * source[1]):
                     case LinkStop(reason=reason):
                         self.problem = f"{reason or 'true'}: an insertion would be stopped"
                     case LinkRefusal(reason=reason):
@@ -98,15 +90,7 @@ class _Topic:
     def summarize(self, now: float, publishers: list[tuple[str, str]]) -> TopicActivity:
         """Return the activity; now: Unix time, s; publishers: of the domain."""
         one, matched = self.subscription, self.readers[0].writers
-        kinds = [kind for topic, kind in publishers if topic == to_dds_topic(one.topic)]
-        wrong = [kind for kind in kinds if kind != to_dds_name(one.kind)]
-        problem = self.problem
-        if wrong:
-            problem = (
-                f"a publisher has the type {make_printable(to_ros_name(wrong[0]))}, which is not received"
-            )
-        elif len(kinds) > matched:
-            problem = "a publisher is not received: its quality of service must be reliable"
+        problem = find_obstacle(one, matched, publishers) or self.problem
         sent = max((time for _, time in self.sources), default=None)
         age = None if sent is None else now - 1e-9 * sent
         return TopicActivity(one.key, one.topic, one.kind, matched, len(self.sources), age, problem)

@@ -10,18 +10,28 @@ ends when the other end is closed.
 import signal
 import sys
 from collections import defaultdict, deque
+from collections.abc import Mapping
 from threading import Event, Thread
 from time import monotonic
 
 from cyclonedds.domain import DomainParticipant
 
-from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.errors import FlexneedleError, make_printable, one_line
 from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, NodeLoss
 from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.ros.composer import MessageComposer
-from flexneedle.lab.ros.dds import TopicReader, TopicWriter, join_domain, make_waitset
+from flexneedle.lab.ros.dds import (
+    DomainDirectory,
+    TopicReader,
+    TopicWriter,
+    join_domain,
+    make_waitset,
+    to_dds_name,
+    to_dds_topic,
+    to_ros_name,
+)
 from flexneedle.lab.ros.parsing import Subscription
-from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, TopicProfile
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, TopicProfile
 from flexneedle.lab.ros.records import JointTargets, NodeSetup, Received, RosHeartbeat
 
 BEAT_S = 0.1
@@ -35,8 +45,22 @@ Input = tuple[Subscription, list[TopicReader]]
 
 def make_inputs(domain: DomainParticipant, profile: TopicProfile) -> list[Input]:
     """Return the subscriptions of a profile with their readers, the first of which matches all publishers."""
-    listed = [Subscription(profile, key) for key in SUBSCRIBED if getattr(profile.subscribe, key) is not None]
+    listed = [Subscription(profile, key) for key in profile.read_topics]
     return [(one, _make_readers(domain, one)) for one in listed]
+
+
+def find_obstacle(subscription: Subscription, matched: int, publishers: list[tuple[str, str]]) -> str:
+    """Return why a publisher of a topic is not received, "" if all are.
+
+    matched: number of publishers that are received; publishers: DDS topic and type of each of the domain.
+    """
+    kinds = [kind for topic, kind in publishers if topic == to_dds_topic(subscription.topic)]
+    wrong = [kind for kind in kinds if kind != to_dds_name(subscription.kind)]
+    if wrong:
+        return f"a publisher has the type {make_printable(to_ros_name(wrong[0]))}, which is not received"
+    if len(kinds) > matched:
+        return "a publisher is not received: its quality of service must be reliable"
+    return ""
 
 
 def _make_readers(domain: DomainParticipant, subscription: Subscription) -> list[TopicReader]:
@@ -71,6 +95,8 @@ class RosNode:
         )
         self._read = make_memory()
         self._refused: dict[str, float] = {}
+        # Not beside stops: to read the domain takes time.
+        self._directory = DomainDirectory(self._domain) if setup.profile.sensors else None
         self._listener = Thread(target=self._listen, name="listener", daemon=True)
 
     def run(self) -> None:
@@ -102,7 +128,16 @@ class RosNode:
 
     def _make_heartbeat(self, now: float) -> RosHeartbeat:
         publishers = {one.key: readers[0].writers for one, readers in self._inputs}
-        return RosHeartbeat(now, {key: one.readers for key, one in self._writers.items()}, publishers)
+        subscribers = {key: one.readers for key, one in self._writers.items()}
+        return RosHeartbeat(now, subscribers, publishers, self._find_obstacles(publishers))
+
+    def _find_obstacles(self, matched: Mapping[str, int]) -> dict[str, str]:
+        silent = [one for one, _ in self._inputs if not matched[one.key]]
+        if self._directory is None or not silent:
+            return {}
+        publishers = self._directory.publishers
+        found = {one.key: find_obstacle(one, 0, publishers) for one in silent}
+        return {key: reason for key, reason in found.items() if reason}
 
     def _forward(self, subscription: Subscription, reader: TopicReader) -> None:
         publishers = reader.writers
@@ -110,7 +145,7 @@ class RosNode:
             if source in self._read[subscription.key]:  # a stop has several readers
                 continue
             self._read[subscription.key].append(source)
-            record = subscription.read(data, monotonic(), publishers)
+            record = subscription.read(data, monotonic(), publishers, 1e-9 * source[1])
             if record is not None and not self._is_repeated(record):
                 self._channel.send(record, keep=isinstance(record, LinkStop | LinkArm))
 

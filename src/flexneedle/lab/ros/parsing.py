@@ -1,22 +1,31 @@
 """Conversion of received messages to records, with checks: other nodes may send anything."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rosbags.serde import SerdeError
 
 from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.link.records import LinkArm, LinkRefusal, LinkStop, LinkTarget
+from flexneedle.lab.link.sensing import MOST_POINTS, read_points
 from flexneedle.lab.link.stamps import StampClock
 from flexneedle.lab.ros.frames import FrameMap
-from flexneedle.lab.ros.profile import SUBSCRIBED, PlacedTopic, TopicProfile
+from flexneedle.lab.ros.needle import is_unfilled, pose_to_point, read_curvatures
+from flexneedle.lab.ros.profile import (
+    CURVATURES,
+    POINT,
+    POSE,
+    SHAPE,
+    PlacedTopic,
+    SensorTopic,
+    TopicProfile,
+)
 from flexneedle.lab.ros.records import JointReading, Received, TipReading
 from flexneedle.record.messages import STORE, Header
-from flexneedle.types import VISIBLE, Point
+from flexneedle.types import VISIBLE, Point, Reading
 
 LARGEST_BYTES = 1_000_000
 """Longer messages are refused unread."""
-MOST_POSES = 10_000
 _BOOL, _HEADER = "std_msgs/msg/Bool", 4  # bytes before the value
 _OF_ONE = ("tip", "shape", "joint_states")
 _MOST_JOINTS = 1000  # of a robot, of which the rig uses a few
@@ -24,26 +33,32 @@ _LONGEST_TEXT = 60
 
 
 class Subscription:
-    """One key of `subscribe`: makes records of the messages of its topic."""
+    """One key of `subscribe`, or `sensors.NAME`: makes records of the messages of its topic."""
 
     def __init__(self, profile: TopicProfile, key: str) -> None:
-        topic = getattr(profile.subscribe, key)
-        self.key, self.topic, self.kind = key, topic.topic, SUBSCRIBED[key]
-        self._frame = FrameMap.of(profile, topic) if isinstance(topic, PlacedTopic) else None
+        topic, self.kind = profile.read_topics[key]
+        self.key, self.topic = key, topic.topic
+        self._frame = FrameMap.of(profile, topic) if isinstance(topic, PlacedTopic) and topic.frame else None
         self._clock = StampClock()
+        self._parse = _SENSOR_PARSERS[self.kind] if isinstance(topic, SensorTopic) else _PARSERS[key]
+        self._is_measurement = isinstance(topic, SensorTopic) or key in _OF_ONE
+        self.order = topic.order if isinstance(topic, SensorTopic) else None
         self.number = self.refused = 0
 
-    def read(self, data: bytes, arrival: float, publishers: int = 1) -> Received | None:
+    def read(self, data: bytes, arrival: float, publishers: int = 1, sent: float = 0.0) -> Received | None:
         """Return the record of a message in CDR that arrived at `arrival` (s, monotonic); None for no request.
 
-        publishers: number of publishers of the topic. A message that cannot be accepted gives a `LinkRefusal`, on the
+        publishers: number of publishers of the topic; sent: stamp (s) of the publisher's DDS, the one of types without
+        a header. A message that cannot be accepted gives a `LinkRefusal`, on the
         topic of stops a `LinkStop`.
         """
         self.number += 1
         try:
-            if publishers > 1 and self.key in _OF_ONE:
+            if publishers > 1 and self._is_measurement:
                 raise InputError(f"{publishers} publishers: measurements must come from one")
-            return _PARSERS[self.key](self, self._deserialize(data), arrival)
+            if self.kind == CURVATURES:
+                arrival = self._clock.to_time(sent, arrival)
+            return self._parse(self, self._deserialize(data), arrival)
         except InputError as error:
             self.refused += 1
             if self.key == "stop":
@@ -95,9 +110,7 @@ def _parse_tip(subscription: Subscription, message: Any, arrival: float) -> TipR
 
 def _parse_shape(subscription: Subscription, message: Any, arrival: float) -> TipReading:
     """Return the last pose, the tip; the others are not used."""
-    count = len(message.poses)
-    if not 1 <= count <= MOST_POSES:
-        raise InputError(f"{count} poses: must be 1 to {MOST_POSES}")
+    _check_count(message.poses)
     return _make_reading(subscription, message.header, message.poses[-1], arrival)
 
 
@@ -106,8 +119,7 @@ def _make_reading(subscription: Subscription, header: Header, pose: Any, arrival
     frame, time = subscription.check_frame(header), subscription.check_stamp(header, arrival)
     position: Point | None = None
     orientation, status = None, VISIBLE
-    numbers = (pose.position, pose.orientation)
-    if not any(getattr(part, axis, 0.0) for part in numbers for axis in "xyzw"):
+    if is_unfilled(pose):
         return TipReading(time, subscription.number, None, None, "missing (position and orientation are 0)")
     try:
         position = frame.to_point(pose.position)
@@ -131,6 +143,36 @@ def _parse_joints(subscription: Subscription, message: Any, arrival: float) -> J
     return JointReading(time, dict(zip(names, positions, strict=True)))
 
 
+def _parse_curvatures(subscription: Subscription, message: Any, time: float) -> Reading:
+    """Return both curvatures of each grating; time: corrected by the publisher's stamp."""
+    return Reading(time, read_curvatures(message, subscription.order))
+
+
+def _parse_points(subscription: Subscription, message: Any, arrival: float) -> Reading:
+    _check_count(message.poses)
+    return _read_poses(subscription, message.header, message.poses, arrival)
+
+
+def _parse_pose(subscription: Subscription, message: Any, arrival: float) -> Reading:
+    return _read_poses(subscription, message.header, [message.pose], arrival)
+
+
+def _read_poses(subscription: Subscription, header: Header, poses: Sequence[Any], arrival: float) -> Reading:
+    frame, time = subscription.check_frame(header), subscription.check_stamp(header, arrival)
+    return Reading(time, *read_points(poses, lambda pose: pose_to_point(frame, pose)))
+
+
+def _parse_point(subscription: Subscription, message: Any, arrival: float) -> Reading:
+    frame = subscription.check_frame(message.header)
+    time = subscription.check_stamp(message.header, arrival)
+    return Reading(time, *read_points([message.point], frame.to_point))
+
+
+def _check_count(poses: Sequence[Any]) -> None:
+    if not 1 <= len(poses) <= MOST_POINTS:
+        raise InputError(f"{len(poses)} poses: must be 1 to {MOST_POINTS}")
+
+
 def _quote(text: str) -> str:
     printable = make_printable(text)
     return repr(printable if len(printable) <= _LONGEST_TEXT else printable[:_LONGEST_TEXT] + "…")
@@ -143,4 +185,10 @@ _PARSERS: dict[str, Callable[[Subscription, Any, float], Received | None]] = {
     "stop": _parse_stop,
     "arm": _parse_arm,
     "joint_states": _parse_joints,
+}
+_SENSOR_PARSERS: dict[str, Callable[[Subscription, Any, float], Received | None]] = {
+    CURVATURES: _parse_curvatures,
+    SHAPE: _parse_points,
+    POINT: _parse_point,
+    POSE: _parse_pose,
 }

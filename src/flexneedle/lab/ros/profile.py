@@ -24,6 +24,7 @@ PROFILES = Library("a profile of ROS topics", "profile", files(__package__) / "p
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LONGEST = 200
+_SENSORS = "sensors."
 
 
 def _check_name(name: str) -> str:
@@ -90,6 +91,47 @@ class ShapeTopic(PlacedTopic):
 
     spacing_mm: Positive | None = None
     """Distance of the poses along the needle, counted from the tip (default: the nodes of the model)."""
+
+
+CURVATURES, SHAPE, POINT, POSE = (
+    "std_msgs/msg/Float64MultiArray",
+    "geometry_msgs/msg/PoseArray",
+    "geometry_msgs/msg/PointStamped",
+    "geometry_msgs/msg/PoseStamped",
+)
+"""Types of the topics of sensors along the needle."""
+
+
+class SensorTopic(PlacedTopic):
+    """Section `sensors.NAME`: a topic of a sensor along the needle.
+
+    Two devices of a rig must not read topics with a common source: a shape is computed from curvatures.
+    """
+
+    type: Literal[
+        "std_msgs/msg/Float64MultiArray",
+        "geometry_msgs/msg/PoseArray",
+        "geometry_msgs/msg/PointStamped",
+        "geometry_msgs/msg/PoseStamped",
+    ]
+    """Type of its messages: curvatures at gratings, points along the needle, or one point."""
+    frame: str = ""
+    """Name of the frame among `frames`; not for curvatures, which are in a frame that rolls with the needle."""
+    order: Literal["sites", "components"] | None = None
+    """Order of curvatures: both of each grating, or one of each grating and then the other. Not set: the order of the
+    layout in the message, without a layout `sites`."""
+    source: Title | None = None
+    """Device that measures. Not set: of curvatures and shapes, the namespace of the topic."""
+
+    @property
+    def sources(self) -> set[str]:
+        """Names of the data: the topic, and its source."""
+        namespace = _namespace(self.topic) if self.type in (CURVATURES, SHAPE) else self.topic
+        return {self.topic, self.source or namespace}
+
+
+def _namespace(topic: str) -> str:
+    return topic.rpartition("/")[0] or topic
 
 
 class PublishedTopics(Section):
@@ -194,23 +236,49 @@ class TopicProfile(Section):
     """Frames by name."""
     publish: PublishedTopics = PublishedTopics()
     subscribe: ReadTopics = ReadTopics()
+    sensors: dict[str, SensorTopic] = Field(default_factory=dict)
+    """Topics of sensors along the needle by name."""
 
     def list_topics(self) -> Iterator[tuple[str, ProfileTopic]]:
-        """Yield `publish.KEY` or `subscribe.KEY` and the topic of each that the profile lists."""
+        """Yield `publish.KEY`, `subscribe.KEY` or `sensors.NAME` and the topic of each that the profile lists."""
         for section in INSERTION_KEYS:
             part = getattr(self, section)
             for key in type(part).model_fields:
                 if (topic := getattr(part, key)) is not None:
                     yield f"{section}.{key}", topic
+        for name, sensor in self.sensors.items():
+            yield f"{_SENSORS}{name}", sensor
 
-    def select(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> "TopicProfile":
+    @property
+    def read_topics(self) -> dict[str, tuple[ProfileTopic, str]]:
+        """Topics that are read, each with its type, by key of `subscribe` or `sensors.NAME`."""
+        listed = {key: getattr(self.subscribe, key) for key in SUBSCRIBED}
+        known = {key: (topic, SUBSCRIBED[key]) for key, topic in listed.items() if topic is not None}
+        return known | {f"{_SENSORS}{name}": (topic, topic.type) for name, topic in self.sensors.items()}
+
+    def find_sources(self, key: str) -> set[str]:
+        """Return the names of the data of a topic that is read, by its key."""
+        topic, kind = self.read_topics[key]
+        if isinstance(topic, SensorTopic):
+            return topic.sources
+        same = (one.sources for one in self.sensors.values() if one.topic == topic.topic)
+        return {topic.topic, *({_namespace(topic.topic)} if kind == SHAPE else ())}.union(*same)
+
+    def select(
+        self,
+        *,
+        publish: Collection[str] = (),
+        subscribe: Collection[str] = (),
+        sensors: Collection[str] = (),
+    ) -> "TopicProfile":
         """Return the profile with these keys alone."""
 
         def reduce(part: Section, keys: Collection[str]) -> Section:
             return part.model_copy(update={key: None for key in type(part).model_fields if key not in keys})
 
         parts = {"publish": reduce(self.publish, publish), "subscribe": reduce(self.subscribe, subscribe)}
-        return self.model_copy(update=parts)
+        kept = {name: topic for name, topic in self.sensors.items() if name in sensors}
+        return self.model_copy(update={**parts, "sensors": kept})
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -222,10 +290,15 @@ def _find_problems(profile: TopicProfile) -> Iterator[Problem]:
     known = ", ".join(profile.frames) or "none"
     owners: dict[str, str] = {}
     for key, topic in profile.list_topics():
-        if (other := owners.setdefault(topic.topic, key)) != key:
+        other = owners.setdefault(topic.topic, key)
+        # One topic may be read in several ways, of which a rig uses one.
+        if other != key and not (isinstance(topic, SensorTopic) and not other.startswith("publish.")):
             rule = f"is also the topic of {other}: a published message must not be read back as a measurement"
             yield Problem(f"{key}.topic", topic.topic, rule)
-        if isinstance(topic, PlacedTopic) and topic.frame not in profile.frames:
+        if isinstance(topic, SensorTopic) and topic.type == CURVATURES:
+            if topic.frame:
+                yield Problem(f"{key}.frame", topic.frame, "curvatures have no frame")
+        elif isinstance(topic, PlacedTopic) and topic.frame not in profile.frames:
             yield Problem(f"{key}.frame", topic.frame, f"must be one of frames: {known}")
 
 
@@ -234,11 +307,18 @@ def load_profile(source: str | Path) -> TopicProfile:
     return PROFILES.load(source, TopicProfile)
 
 
-def load_part(name: str, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> TopicProfile:
+def load_part(
+    name: str,
+    *,
+    publish: Collection[str] = (),
+    subscribe: Collection[str] = (),
+    sensors: Collection[str] = (),
+) -> TopicProfile:
     """Return a profile reduced to some keys. Raises RigError if it lacks one."""
     profile = load_profile(name)
     known = dict(profile.list_topics())
-    for key in (*(f"publish.{key}" for key in publish), *(f"subscribe.{key}" for key in subscribe)):
+    wanted = {"publish": publish, "subscribe": subscribe, "sensors": sensors}
+    for key in (f"{section}.{key}" for section, keys in wanted.items() for key in keys):
         if key not in known:
             raise RigError(to_line(Problem("profile", name, f"must list {key}; it lists {', '.join(known)}")))
-    return profile.select(publish=publish, subscribe=subscribe)
+    return profile.select(publish=publish, subscribe=subscribe, sensors=sensors)

@@ -5,11 +5,11 @@ Lengths are in mm in the frame of the insertion: x along its axis into the tissu
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from flexneedle.lab.link.records import NodeHeartbeat, Requested
 from flexneedle.lab.ros.profile import TopicProfile
-from flexneedle.types import VISIBLE, Floats, Point, Quaternion
+from flexneedle.types import VISIBLE, Floats, Point, Quaternion, Reading
 
 # Published
 
@@ -89,11 +89,14 @@ class NodeSetup:
 class RosHeartbeat(NodeHeartbeat):
     """A sign of life of the node.
 
-    subscribers: number of subscribers by key of `publish`; publishers: number of publishers by key of `subscribe`.
+    subscribers: number of subscribers by key of `publish`; publishers: number of publishers by key of `subscribe`;
+    obstacles: why a publisher of a sensor's topic is not received, by key `sensors.NAME`, only of those that are not.
     """
 
     subscribers: Mapping[str, int]
     publishers: Mapping[str, int]
+    obstacles: Mapping[str, str] = field(default_factory=dict)
 
 
-Received = Requested | TipReading | JointReading
+Received = Requested | TipReading | JointReading | Reading
+"""A `Reading` of a topic of curvatures has both of each grating, as they are in the message."""

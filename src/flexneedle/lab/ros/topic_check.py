@@ -69,8 +69,12 @@ def _count(number: int, noun: str) -> str:
 
 
 def _list_used(rig: RigFile, settings: RosSettings) -> set[str]:
-    """Return the used keys of `subscribe`: for the insertion, and for a driver and tracker of the same topics."""
-    parts = (rig.driver, "joint_states"), (rig.tracker, str(rig.tracker.settings.get("source", "tip")))
+    """Return the used keys: for the insertion, and for a driver, tracker and sensors of the same topics."""
+    parts = (
+        (rig.driver, "joint_states"),
+        (rig.tracker, str(rig.tracker.settings.get("source", "tip"))),
+        *((one, f"sensors.{one.settings.get('topic', one.name)}") for one in rig.sensor),
+    )
     devices = (key for part, key in parts if _get_profile(part) == settings.profile)
     return {"stop", "arm", *devices, *(("target",) if settings.target else ())}
 

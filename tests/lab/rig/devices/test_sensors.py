@@ -34,6 +34,12 @@ class Gratings:
         self.count, self.closed, self.result = int(50.0 * clock.now() + 1e-6), False, None
         Gratings.opened.append(self)
 
+    @staticmethod
+    def with_scenario(settings, clock, sensor, scenario=None):
+        made = Gratings(settings, clock, sensor)
+        made.scenario = scenario
+        return made
+
     def read(self):
         if self.result is not None:
             return self.result
@@ -75,6 +81,13 @@ def test_each_sensor_gets_its_settings_the_clock_and_the_scenarios_sensor():
     assert all(one.closed for one in Gratings.opened)
 
 
+def test_a_fourth_parameter_gets_the_scenario(monkeypatch):
+    monkeypatch.setitem(sys.modules, "own", SimpleNamespace(Gratings=Gratings.with_scenario))
+    wanted = scenario(FBG)
+    with open_sensors(parts(table()), (FBG,), ManualClock(), wanted):
+        assert Gratings.opened[0].scenario is wanted
+
+
 def test_a_sensor_that_fails_to_open_closes_the_others():
     with (
         pytest.raises(DriverError, match="sensor back own:Gratings: RuntimeError: no light"),
@@ -102,7 +115,7 @@ def test_an_unknown_kind_is_refused():
 
 def test_registered_kinds_exist():
     points = PROJECT["entry-points"][SENSORS]
-    assert set(points) == {"fbgs", "interrogator"}
+    assert set(points) == {"fbgs", "igtl", "interrogator", "ros"}
     assert all(callable(load_part(value, ())) for value in points.values())
 
 

@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import entry_points
+from inspect import signature
 from math import hypot
 from numbers import Real
 from typing import Any, Protocol
@@ -32,6 +33,7 @@ from flexneedle.plugins import (
     parts_of,
 )
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState, NeedleSensor, Tracker
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import Frame, Point, Quaternion, Reading, SensorReading
 
@@ -43,7 +45,10 @@ MotorsFactory = Callable[[Mapping[str, Any], Sequence[str]], Motors]
 TrackerFactory = Callable[[Mapping[str, Any], Clock], Tracker]
 """Makes a tracker from its settings and the clock of the run; it has `close`, or is a context manager."""
 SensorFactory = Callable[[Mapping[str, Any], Clock, Sensor], NeedleSensor]
-"""Makes a sensor along the needle from its settings, the clock of the run and the scenario's sensor; as a tracker."""
+"""Makes a sensor along the needle from its settings, the clock of the run and the scenario's sensor; as a tracker.
+
+It may have a fourth parameter `scenario`, None without one.
+"""
 
 Rule = Callable[[Any], str]
 """Returns the rule that a value breaks, or ""."""
@@ -130,7 +135,10 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
 
 @contextmanager
 def open_sensors(
-    parts: Sequence[SensorSection], sensors: Sequence[Sensor], clock: Clock
+    parts: Sequence[SensorSection],
+    sensors: Sequence[Sensor],
+    clock: Clock,
+    scenario: Scenario | None = None,
 ) -> Iterator[dict[str, OpenNeedleSensor]]:
     """Open sensors along the needle, and yield them by name.
 
@@ -138,6 +146,7 @@ def open_sensors(
         parts: Sensors of a rig file.
         sensors: Sensors of the scenario, one for each of the rig file (`fit_problems`).
         clock: The clock of the run, on which readings have their times.
+        scenario: The scenario, for sensors that need its registration of the image.
 
     Raises:
         RigError, RunError, DriverError: As in `open_tracker`.
@@ -145,16 +154,20 @@ def open_sensors(
     wanted = {one.title: one for one in sensors}
     with ExitStack() as stack:
         yield {
-            one.name: stack.enter_context(closing(open_sensor(one, wanted[one.name], clock))) for one in parts
+            one.name: stack.enter_context(closing(open_sensor(one, wanted[one.name], clock, scenario)))
+            for one in parts
         }
 
 
-def open_sensor(part: SensorSection, sensor: Sensor, clock: Clock) -> OpenNeedleSensor:
+def open_sensor(
+    part: SensorSection, sensor: Sensor, clock: Clock, scenario: Scenario | None = None
+) -> OpenNeedleSensor:
     """Return a sensor along the needle, started; `close` stops it. Raises as `open_tracker`."""
     section = f"sensor {part.name}"
     factory = _load_factory(section, SENSORS, part, ("settings", "clock", "sensor"))
+    further = {"scenario": scenario} if "scenario" in signature(factory).parameters else {}
     with convert_exceptions(_label(section, part)):
-        made = _call_factory(section, part, lambda: factory(part.settings, clock, sensor))
+        made = _call_factory(section, part, lambda: factory(part.settings, clock, sensor, **further))
         opened: OpenNeedleSensor = _guard(section, part, made, parts_of(NeedleSensor), _SENSOR)
     return opened
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from flexneedle.lab.rig.devices.sources import source_problems
 from flexneedle.lab.rig.preflight.start import SDS, axis_start_problem
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
@@ -58,7 +59,7 @@ def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation
 
 
 def _sensor_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
-    """Yield sensors along the needle that only the rig or only the scenario has."""
+    """Yield sensors along the needle that only the rig or only the scenario has, or whose data are used twice."""
     wanted, given = [one.title for one in scenario.sensor], [one.name for one in rig.sensor]
     for n, name in enumerate(given):
         if name not in wanted:
@@ -75,6 +76,7 @@ def _sensor_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
                 None,
                 f'the rig has no device for {name}: add [[sensor]] with name = "{name}" to its file',
             )
+    yield from source_problems(rig)
 
 
 def room_problem(rig: RigFile, scenario: Scenario, position: float) -> str:

@@ -86,23 +86,23 @@ def check_rig(
         lambda: open_tracker(rig, clock),
         lambda t: check_tracker(rig, t, clock, seconds, wanted, rolls[-1]),
     )
-    sensors = () if wanted is None else wanted.scenario.sensor
     for part in rig.sensor:
-        found += _sensor_part_findings(part, sensors, clock, seconds)
+        found += _sensor_part_findings(part, None if wanted is None else wanted.scenario, clock, seconds)
     return found
 
 
 def _sensor_part_findings(
-    part: SensorSection, sensors: Sequence[Sensor], clock: Clock, seconds: float
+    part: SensorSection, scenario: Scenario | None, clock: Clock, seconds: float
 ) -> list[Finding]:
     """Return the findings of a sensor along the needle, none if it is no sensor of the scenario."""
+    sensors = () if scenario is None else scenario.sensor
     name, wanted = f"sensor {part.name}", next((one for one in sensors if one.title == part.name), None)
     if wanted is None:
         return []
     return check_device(
         name,
         part.kind,
-        lambda: open_sensor(part, wanted, clock),
+        lambda: open_sensor(part, wanted, clock, scenario),
         lambda device: check_sensor(name, wanted, device, clock, seconds),
     )
 

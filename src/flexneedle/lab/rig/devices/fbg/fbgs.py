@@ -14,14 +14,14 @@ from threading import Event, Thread
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field
 
 from flexneedle.errors import DriverError, make_printable
-from flexneedle.lab.rig.devices.fbg.mounting import MountingSettings, SiteMap, require_fbg
+from flexneedle.lab.rig.devices.fbg.mounting import GratingSettings, SiteMap, require_fbg
 from flexneedle.lab.rig.devices.fbg.stream import PORT, FibreFrame, FrameDecoder
 from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.ports import Clock
-from flexneedle.scenario.sections.fields import Positive, one_line
+from flexneedle.scenario.sections.fields import one_line
 from flexneedle.scenario.sensors.fbg import Fbg
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import VISIBLE, Reading
@@ -35,7 +35,7 @@ _MOST_AT_ONCE = 1 << 22  # bytes: seconds of frames with spectra
 _MOST_READINGS = 1000  # that wait to be read
 
 
-class FbgsSettings(MountingSettings):
+class FbgsSettings(GratingSettings):
     """Keys beside `name` and `kind = "fbgs"` in a table `[[sensor]]` of a rig file."""
 
     host: Annotated[str, Field(min_length=1, max_length=255), AfterValidator(one_line)]
@@ -44,20 +44,10 @@ class FbgsSettings(MountingSettings):
     """Port of the stream."""
     fibre: Annotated[int, Field(ge=0, le=255)] = 0
     """Number of the fibre in the stream; frames of others are skipped."""
-    positions_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=2, max_length=1000)]
-    """Distances of the gratings from the tip, in the order of the values in the stream."""
     first: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of the first value used, which belongs to the first position. 1: the first value of the stream."""
     late_ms: Annotated[float, Field(ge=20, le=10_000)] = 250.0
     """Time without a reading after which the status is not ok."""
-
-    @field_validator("positions_mm")
-    @classmethod
-    def _check_order(cls, positions: tuple[float, ...]) -> tuple[float, ...]:
-        steps = np.diff(positions)
-        if not (np.all(steps > 0.0) or np.all(steps < 0.0)):
-            raise ValueError("must rise or fall")
-        return positions
 
 
 class FrameReader:

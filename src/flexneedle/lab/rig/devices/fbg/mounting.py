@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from flexneedle.errors import RigError
 from flexneedle.scenario.problems import Problem, to_line
@@ -31,6 +31,21 @@ class MountingSettings(Section):
     """Factor of the curvatures."""
 
 
+class GratingSettings(MountingSettings):
+    """Keys of a fibre whose device gives curvatures."""
+
+    positions_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=2, max_length=1000)]
+    """Distances of the gratings from the tip, in the order of the values of the device."""
+
+    @field_validator("positions_mm")
+    @classmethod
+    def _check_order(cls, positions: tuple[float, ...]) -> tuple[float, ...]:
+        steps = np.diff(positions)
+        if not (np.all(steps > 0.0) or np.all(steps < 0.0)):
+            raise ValueError("must rise or fall")
+        return positions
+
+
 def require_fbg(kind: str, sensor: Sensor) -> Fbg:
     """Return a sensor of a scenario that measures curvatures. Raises RigError for another one."""
     if isinstance(sensor, Fbg):
@@ -48,6 +63,9 @@ class SiteMap:
         sites: Distances of the sites from the tip (mm).
         mounting: Turn, direction and gain.
 
+    Attributes:
+        gratings: Number of gratings.
+
     Raises:
         RigError: A site is not between the first and the last grating, or there are too few or too many offsets.
     """
@@ -55,6 +73,7 @@ class SiteMap:
     def __init__(
         self, positions: Sequence[float], sites: Sequence[float], mounting: MountingSettings
     ) -> None:
+        self.gratings = len(positions)
         order = np.argsort(positions)
         ascending, wanted = np.asarray(positions)[order], np.asarray(sites)
         rule = f"must be between {ascending[0]:g} and {ascending[-1]:g}, the outer gratings of the device"

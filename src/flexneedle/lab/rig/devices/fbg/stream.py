@@ -27,11 +27,12 @@ MOST_BYTES = 1 << 20
 """Longest accepted payload."""
 ERROR, LINE, STAMP, CURVATURE, ANGLE = range(5)
 """Ids of the fields that are read."""
+SHARPEST = 1.0
+"""Curvature that no needle has, 1/mm."""
 
 _LENGTH = struct.Struct("<I")
 _FIELD = struct.Struct("<iH")
 _ID_BYTES, _FLOAT_BYTES = 2, 4
-_SHARPEST = 1.0  # 1/mm: of no needle
 _MOST_BAD = 10  # in a row: then the stream is not one of frames
 
 
@@ -62,7 +63,7 @@ class FibreFrame:
     @property
     def bends(self) -> "np.ndarray[tuple[int], np.dtype[np.complex128]]":
         """Complex curvatures κ e^(iα), (n,), 1/mm; NaN where a value is not finite, or a radius below 1 mm."""
-        fine = (np.abs(self.curvature) <= _SHARPEST) & np.isfinite(self.angle)
+        fine = (np.abs(self.curvature) <= SHARPEST) & np.isfinite(self.angle)
         kappa, angle = np.where(fine, self.curvature, np.nan), np.where(fine, self.angle, 0.0)
         return kappa * np.cos(angle) + 1j * (kappa * np.sin(angle))
 
