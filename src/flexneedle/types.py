@@ -423,8 +423,8 @@ class CheckedReading:
 class SensorState:
     """A sensor after a period, for the record.
 
-    readings: of this period, with their verdicts; verdict: on the sensor: OK while it corrects the model; nis: normalised
-    square of the innovation, 1 on average, NaN without a good reading.
+    readings: of this period, with their verdicts; verdict: on the sensor: OK while it corrects the model; nis:
+    normalised square of the innovation, 1 on average, NaN without a good reading.
     """
 
     name: str

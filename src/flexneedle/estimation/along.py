@@ -23,8 +23,7 @@ _ROUNDING_S = 1e-9
 class SensorSlots(NamedTuple):
     """Places of a sensor's parameters: offset (d), and where they exist gain errors, turn (rad) and clock error (s).
 
-    drift: steps, one after another, of an error of all values that grows along the way; place: places of the sensor; gain:
-    of each pair of values.
+    drift: steps, one after another, of an error of all values that grows along the way; gain: of each pair of values.
     """
 
     offset: slice
@@ -54,7 +53,8 @@ class Timeline(NamedTuple):
             ]
         ).reshape(-1, 5)
         turned = rows[:, 3] + rows[:, 4]
-        return Timeline(*rows[:, :3].T, roll + np.cumsum(turned) - turned, turned)
+        begun, travel_begun, ended = rows[:, :3].T
+        return Timeline(begun, travel_begun, ended, roll + np.cumsum(turned) - turned, turned)
 
     def at(self, times: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
         """Return move, share of it done, and angle of the needle (r,), at times (r,)."""
@@ -65,7 +65,8 @@ class Timeline(NamedTuple):
         return index, part, self.angle[index] + part * self.turned[index]
 
 
-class Bins(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Bins:
     """Means of readings over b moves, in the stage's axes."""
 
     index: NDArray[np.intp]  # moves (b,)
@@ -134,10 +135,9 @@ class SensorFit:
         """Return the sensor whose readings from a time (s) on do not count."""
         return replace(self, used=self.used & (self.time < since))
 
-    def parameter(self, parameters: Floats, name: str) -> float:
-        """Return turn or clock error of parameters (K,); 0 where it is not estimated."""
-        place = getattr(self.slots, name)
-        return 0.0 if place is None else float(parameters[place])
+    def clock(self, parameters: Floats) -> float:
+        """Return the clock error (s) of parameters (K,); 0 where it is not estimated."""
+        return 0.0 if self.slots.clock is None else parameters.item(self.slots.clock)
 
     @cached_property
     def _known(self) -> tuple[Floats, Floats]:
@@ -161,7 +161,9 @@ class SensorFit:
         number, count = total(np.ones(len(index))), total(seen.astype(float))
         level = np.where(seen, value, 0.0)
         mean = total(self._turned(level, facing)) / np.maximum(count, 1.0)
-        return Bins(index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number)
+        return Bins(
+            index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number
+        )
 
     def quantities(self, poses: Floats, length: float) -> Floats:
         """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm).
@@ -180,15 +182,19 @@ class SensorFit:
         level = ends[:, :, 0]
         return level + ends[:, :, 1:] @ parameters[self.slots.place] if ends.shape[2] > 1 else level
 
-    def predict_at(self, time: Floats, ends: Floats, depth: float, line: Timeline, parameters: Floats) -> Floats:
-        """Return the predicted values (r, d) at times (r,), from `quantities` (m + 1, d, 1 + p) at the ends of the moves.
+    def predict_at(
+        self, time: Floats, ends: Floats, depth: float, line: Timeline, parameters: Floats
+    ) -> Floats:
+        """Return the predicted values (r, d) at times (r,), with the tip at a depth (mm).
 
-        depth: of the tip (mm).
+        ends (m + 1, d, 1 + p): `quantities` at the ends of the moves.
         """
-        index, part, angle = line.at(time - self.parameter(parameters, "clock"))
+        index, part, angle = line.at(time - self.clock(parameters))
         ends = self.placed(ends, parameters)
         level = (1.0 - part)[:, None] * ends[index] + part[:, None] * ends[index + 1]
-        return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + self._errors(np.array([depth]), parameters)
+        return self._turned(self._with_gain(level, parameters), np.exp(-1j * angle)) + self._errors(
+            np.array([depth]), parameters
+        )
 
     def bin_at(self, time: Floats, line: Timeline) -> Bins:
         """Return bins (b,) of one reading each, at times (b,)."""
@@ -216,7 +222,7 @@ class SensorFit:
         return np.where(bins.count > 0.0, noise, np.inf)
 
     def expected(self, bins: Bins, ends: Floats, depth: Floats, parameters: Floats) -> Floats:
-        """Return the predicted means (b, d), of `quantities` at the ends of the moves, with the tip at depths (b,), mm."""
+        """Return the predicted means (b, d), with the tip at depths (b,), mm; ends: as for `predict_at`."""
         level = self._with_gain(between(bins, self.placed(ends, parameters)), parameters)
         return level + self._turned(self._errors(depth, parameters), bins.facing)
 
@@ -262,7 +268,9 @@ class SensorFit:
         for k in range(slopes_of_places.shape[2]):
             jacobian[:, :, self.slots.place.start + k] = between(bins, slopes_of_places[:, :, k])
         if count := self.slots.gain.stop - self.slots.gain.start:
-            jacobian[:, :, self.slots.gain] = level[:, :, None] * np.repeat(np.eye(count), level.shape[1] // count, axis=0)
+            jacobian[:, :, self.slots.gain] = level[:, :, None] * np.repeat(
+                np.eye(count), level.shape[1] // count, axis=0
+            )
         if self.slots.turn is not None:
             jacobian[:, :, self.slots.turn] = turn(level, np.array(1j), self.axes)
         if self.slots.clock is not None:
@@ -290,8 +298,8 @@ def between(bins: Bins, ends: Floats) -> Floats:
 def whiten(rows: Sequence[NDArray[Any]], variance: Floats, sd: float, distance: Floats) -> list[NDArray[Any]]:
     """Return arrays (b, …) with the noise of their rows made white, of variance 1.
 
-    Its covariance is `variance` (b,) on the diagonal and sd² e^(−|d_i − d_j|) elsewhere and on it; distance (b,) is over
-    the correlation's. Rows without a finite variance become 0.
+    Its covariance is sd² e^(−|d_i − d_j|), and `variance` (b,) more on the diagonal; distance (b,) is over the
+    correlation's. Rows without a finite variance become 0.
     """
     known = np.isfinite(variance)
     if sd == 0.0:

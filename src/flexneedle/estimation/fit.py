@@ -33,13 +33,15 @@ def improve_fit(fitted: Fitted) -> Fitted:
     The step is shortened until the cost does not rise.
     """
     prior = fitted.prior
-    jacobian = jacobian_of(fitted)
-    both = zip(fitted.variances(), fitted.readings, fitted.laterals, strict=True)
-    variance = np.concatenate([noise + readings.estimate_sag(tips) ** 2 for noise, readings, tips in both])
+    jacobian, variance = jacobian_of(fitted), variance_of_rows(fitted)
     left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
-    whitening = Whitening.of(fitted, variance)
+    whitening = Whitening.of(fitted, variance) if fitted.field_sd else None
     if whitening:
-        jacobian, left, variance = whitening.of_rows(jacobian), whitening.of_rows(left), np.ones_like(variance)
+        jacobian, left, variance = (
+            whitening.of_rows(jacobian),
+            whitening.of_rows(left),
+            np.ones_like(variance),
+        )
     weighted = jacobian.conj().T / variance
     gradient = (weighted @ left).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
@@ -50,10 +52,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
 
     def cost(other: FittedInsertion) -> float:
-        left = np.concatenate(other.residuals)
-        squares = np.abs(whitening.of_rows(left) if whitening else left) ** 2
-        own = float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
-        return own + cost_along(other) if other.along else own
+        return cost_of(other, variance, whitening)
 
     most = cost(fitted)
 
@@ -69,6 +68,20 @@ def improve_fit(fitted: Fitted) -> Fitted:
         if not is_worse(trial):
             break
     return differentiate(trial)
+
+
+def variance_of_rows(fitted: FittedInsertion) -> Floats:
+    """Return the variances (r,) of the rows of the tip's sensors."""
+    both = zip(fitted.variances(), fitted.readings, fitted.laterals, strict=True)
+    return np.concatenate([noise + readings.estimate_sag(tips) ** 2 for noise, readings, tips in both])
+
+
+def cost_of(fitted: FittedInsertion, variance: Floats, whitening: "Whitening | None") -> float:
+    """Return the negative logarithm of the posterior density, up to a constant, with variances of the tip's rows."""
+    left = np.concatenate(fitted.residuals)
+    squares = np.abs(whitening.of_rows(left) if whitening else left) ** 2
+    own = float(0.5 * (squares / variance).sum()) + fitted.prior.cost(fitted.parameters)
+    return own + cost_along(fitted) if fitted.along else own
 
 
 def step_within(precision: Floats, gradient: Floats, bounds: Floats) -> Floats:
@@ -115,17 +128,15 @@ class Whitening(NamedTuple):
     variance: Floats  # variances of all rows without that error
 
     @staticmethod
-    def of(fitted: FittedInsertion, variance: Floats) -> "Whitening | None":
-        """Return the whitening of rows with variances (r,); None for a field without error."""
-        if fitted.field_sd == 0.0:
-            return None
+    def of(fitted: FittedInsertion, variance: Floats) -> "Whitening":
+        """Return the whitening of rows with variances (r,)."""
         position = fitted.readings[0]
         path = np.cumsum(np.append(0.0, np.abs(fitted.rows[:, DB_X])))
         length = fitted.nominal.scenario.tracker.field_length_mm
         count, place = len(position.index), position.between(path) / length
         correlated = np.exp(-np.abs(place[:, None] - place))
         covariance = np.diag(variance[:count]) + fitted.field_sd**2 * correlated
-        return Whitening(np.linalg.cholesky(covariance), variance)
+        return Whitening(np.linalg.cholesky(covariance).astype(np.float64), variance)
 
     def of_rows(self, rows: Laterals) -> Laterals:
         """Return rows (r, …) with white noise of variance 1."""
@@ -161,7 +172,12 @@ def _whitened(one: SensorFit, bins: Bins, *arrays: Floats) -> Iterator[list[Floa
     variances = one.variances(bins)
     wander, distance = one.sensor.wander_sd, bins.time / one.sensor.wander_s
     if wander == 0.0:
-        yield whiten([each.reshape(variances.size, *each.shape[2:]) for each in arrays], variances.ravel(), 0.0, distance)
+        yield whiten(
+            [each.reshape(variances.size, *each.shape[2:]) for each in arrays],
+            variances.ravel(),
+            0.0,
+            distance,
+        )
         return
     for k, variance in enumerate(variances.T):
         yield whiten([each[:, k] for each in arrays], variance, wander, distance)
@@ -210,7 +226,13 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
     if fitted.along and needles.begun:
         whole = fitted.quantities_of(np.concatenate([shapes, further.shapes], axis=1))
         along_curves = tuple(
-            _renew(old, needles.begun, (each[1:, ..., 0] - each[0, ..., 0]) / fitted.prior.steps[needles.begun, None, None], depth, fitted.grid)
+            _renew(
+                old,
+                needles.begun,
+                (each[1:, ..., 0] - each[0, ..., 0]) / fitted.prior.steps[needles.begun, None, None],
+                depth,
+                fitted.grid,
+            )
             for old, each in zip(along_curves, whole, strict=True)
         )
     reached = zip(needles.begun, models[1:], states[1:], strict=True)

@@ -144,7 +144,7 @@ class FittedInsertion:
     @cached_property
     def bins(self) -> list[Bins]:
         """Means of the readings of each sensor along the needle."""
-        return [one.bins(self.timeline, one.parameter(self.parameters, "clock")) for one in self.along]
+        return [one.bins(self.timeline, one.clock(self.parameters)) for one in self.along]
 
     @cached_property
     def along_residuals(self) -> list[Floats]:

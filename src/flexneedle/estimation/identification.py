@@ -34,19 +34,43 @@ from flexneedle.estimation.axial import (
     rest_variance,
 )
 from flexneedle.estimation.estimate import NONE, describe_estimate
-from flexneedle.estimation.fit import ROUND, Whitening, differentiate, improve_fit, simulate_due
+from flexneedle.estimation.fit import (
+    ROUND,
+    Whitening,
+    cost_of,
+    differentiate,
+    improve_fit,
+    simulate_due,
+    variance_of_rows,
+)
 from flexneedle.estimation.fitted import FittedInsertion
 from flexneedle.estimation.lateral import components, directions, from_components, variance_of
-from flexneedle.estimation.moves import Move, assign_readings, position_along
+from flexneedle.estimation.moves import Move, assign_readings, position_along, tip_of
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, PSI, STILL, THETA, Floats, Laterals, Measurement, Motion, Needles, Point, Reading, X, Z
+from flexneedle.types import (
+    DB_X,
+    PSI,
+    STILL,
+    THETA,
+    Floats,
+    Laterals,
+    Measurement,
+    Motion,
+    Needles,
+    Point,
+    Reading,
+    X,
+    Z,
+)
 
 _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
+TRACKER = "tracker"
+"""Name of the tracker among the sensors."""
+_REFITS = 3  # steps of the fit after a sensor is excluded
 _KNOTS = 3  # of a drift, down to the target
 _RECENT = 12  # moves whose residuals are low-passed
 
@@ -230,7 +254,7 @@ class Identified(FittedInsertion):
     @property
     def _tip_slope(self) -> Laterals:
         """Derivatives (K,) of the tip's lateral position to the parameters."""
-        slope = self.slopes(self.state.tip[:1])[0]
+        slope: Laterals = self.slopes(self.state.tip[:1])[0]
         slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
         return slope
 
@@ -255,23 +279,73 @@ class Identified(FittedInsertion):
         return self.axial_bias, y, z
 
     def without_field(self, left: Laterals) -> Laterals:
-        """Return residuals (r,) of the tip's position without the error of the tracker's field, as far as it is known."""
+        """Return residuals (r,) of the tip's position without the known part of the field's error."""
         if self.field_sd == 0.0:
             return left
         field = Whitening.of(self, self.variances()[0])
         lower = field.lower
         covariance = lower @ lower.T - np.diag(field.variance)
-        return left - covariance @ np.linalg.solve(lower.T, np.linalg.solve(lower, left))
+        without: Laterals = left - covariance @ np.linalg.solve(lower.T, np.linalg.solve(lower, left))
+        return without
 
     def _add(self, one: SensorFit, readings: Sequence[Reading]) -> SensorFit:
         """Return a sensor along the needle with new readings."""
-        return one.add(np.array([each.time for each in readings]), self._values(one, readings)) if readings else one
+        return (
+            one.add(np.array([each.time for each in readings]), self._values(one, readings))
+            if readings
+            else one
+        )
 
     def _values(self, one: SensorFit, readings: Sequence[Reading]) -> Floats:
         """Return the values (r, d) of readings."""
         length = self.nominal.scenario.needle.length_mm
         needle = Needles(self.state.nodes[None], length / (len(self.state.nodes) - 1))
         return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
+
+    def without(self, name: str, since: float) -> "Identified":
+        """Return the estimate fitted again without the readings from a time (s) on of a sensor: `TRACKER` or its name."""
+        if name == TRACKER:
+            moves = tuple(done.without_readings(since) for done in self.moves)
+            fitted = self.change(moves=moves)._fit_axially()
+        else:
+            along = tuple(one.without(since) if one.name == name else one for one in self.along)
+            fitted = self.change(along=along)
+        for _ in range(_REFITS):
+            fitted = improve_fit(fitted)
+        if not len(fitted.readings[0].index):
+            return fitted.change(residual=0.0)
+        left = fitted.residuals[0]
+        inside = fitted.tips[-1, X] > 0.0
+        return fitted.change(residual=low_pass(self.settings, fitted.without_field(left)) if inside else 0.0)
+
+    @property
+    def cost(self) -> float:
+        """Negative logarithm of the posterior density, up to a constant."""
+        variance = variance_of_rows(self)
+        return cost_of(self, variance, Whitening.of(self, variance) if self.field_sd else None)
+
+    def count_values(self, name: str, since: float) -> int:
+        """Return the number of values of a sensor from a time (s) on: `TRACKER`, or its name."""
+        if name == TRACKER:
+            recent = [k for k, done in enumerate(self.moves) if done.motion.ended >= since]
+            return self.axes * int(np.isin(self.readings[0].index, recent).sum())
+        k = next(k for k, one in enumerate(self.along) if one.name == name)
+        bins = self.bins[k]
+        return int((bins.count[bins.time >= since] > 0.0).sum())
+
+    def compare_tip(self, measurements: Sequence[Measurement]) -> float:
+        """Return the normalised square of the mean lateral innovation of readings of the tip, 1 on average."""
+        places = [np.subtract(tip_of(one), self.tip_at(one.time))[1:] for one in measurements]
+        off = np.mean(places, axis=0)[: self.axes]
+        slope = self._tip_slope
+        if self.slots.bias.stop:
+            slope[self.slots.bias] = directions(1.0, self.axes)
+        parts = np.stack([slope.real, slope.imag])[: self.axes]
+        scenario = self.nominal.scenario
+        own = scenario.tracker.jitter_per_axis**2 / len(places) + self.field_sd**2
+        own += self.sensors[0].unexplained(scenario, self.settings) ** 2
+        known = parts @ self.covariance @ parts.T + own * np.eye(self.axes)
+        return float(off @ np.linalg.solve(known, off)) / self.axes
 
     def compare(self, name: str, readings: Sequence[Reading]) -> Comparison:
         """Return readings (r,) of a sensor along the needle beside their predictions."""
@@ -283,7 +357,11 @@ class Identified(FittedInsertion):
         depth = self.depths(bins)
         slopes = self.along_slopes(depth, k)
         jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)[0]
-        known = jacobian @ self.covariance @ jacobian.T + np.diag(one.model_sd**2) + one.sensor.wander_sd**2 * np.eye(len(jacobian))
+        known = (
+            jacobian @ self.covariance @ jacobian.T
+            + np.diag(one.model_sd**2)
+            + one.sensor.wander_sd**2 * np.eye(len(jacobian))
+        )
         return Comparison(values, values - predicted, known, one.sensor.noise)
 
     def shape_sd(self, nodes: Floats) -> Floats:
@@ -351,7 +429,9 @@ class Identified(FittedInsertion):
     def tracked(self) -> bool:
         """True if the tracker measured the tip lately, so that it will again."""
         limit = self.nominal.scenario.control.hold_limit_s
-        return not self.along or (bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit)
+        return not self.along or (
+            bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit
+        )
 
     @property
     def roll_sd(self) -> float:
@@ -422,7 +502,8 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
 def planned_shapes(task: Task, state: State) -> Floats:
     """Return the poses (m, n, 5) of the needle along the plan, of the scenario's model."""
     rows = task.plan.controls[None]
-    return task.simulator.rollout(state, rows, outputs=("shapes",), limits=False).shapes[0]
+    shapes: Floats = task.simulator.rollout(state, rows, outputs=("shapes",), limits=False).shapes[0]
+    return shapes
 
 
 def low_pass(settings: Priors, left: Laterals) -> complex:

@@ -27,8 +27,9 @@ from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, STILL, THETA, Floats, Measurement, Motion, Point, Reading, X, Y, Z
+from flexneedle.types import DB_X, ORIGIN, STILL, THETA, Floats, Measurement, Motion, Point, Reading, X, Y, Z
 
+_APART_MM = 1.0  # least distance along x of points that hold the needle, and of the last from the tip
 _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model's error
 
 
@@ -136,14 +137,18 @@ class Corrected:
     def observe(
         self, measurements: Sequence[Measurement], along: Mapping[str, Sequence[Reading]] = NONE
     ) -> "Corrected":
-        """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived."""
+        """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived.
+
+        With `control.essential_points` the newest points of sensors along the needle hold it, too.
+        """
         used = drop_roll_readings(self.moves, measurements)
         moves = assign_readings(self.moves, used)
         newest = max((one.time for one in used), default=-np.inf)
         at = replace(self, state=self.past, moves=moves)
         past, closed, tips = at, 0, [at.tip]
+        points = _newest_points(along) if self.simulator.scenario.control.essential_points else ()
         for k, done in enumerate(moves):
-            at = _follow(at, done)
+            at = _follow(at, done, points if k == len(moves) - 1 else ())
             tips.append(at.tip)
             if closed == k and newest >= done.motion.ended - 1e-9:
                 past, closed = at, k + 1
@@ -160,8 +165,17 @@ class Corrected:
         )
 
 
-def _follow(at: Corrected, done: Move) -> Corrected:
-    """Return the estimate after a move: predicted, and corrected by the mean innovation of its readings."""
+def _newest_points(along: Mapping[str, Sequence[Reading]]) -> tuple[Point, ...]:
+    """Return x, y, z (mm) of the newest reading of each sensor that has them."""
+    rows = (row for readings in along.values() if readings for row in readings[-1].rows)
+    return tuple((row[0], row[1], row[2]) for row in rows if len(row) == len(ORIGIN))
+
+
+def _follow(at: Corrected, done: Move, points: Sequence[Point] = ()) -> Corrected:
+    """Return the estimate after a move: predicted, and corrected by the mean innovation of its readings.
+
+    points: that hold the needle in tissue.
+    """
     before, predicted = at.tip, carry_out(at.simulator, at.state, done.applied, at.axial_scale)
     if not done.measurements:
         return replace(at, state=predicted)
@@ -175,7 +189,7 @@ def _follow(at: Corrected, done: Move) -> Corrected:
         measured=_as_point(measured),
     )
     if predicted.tip[0] > 0.0:
-        return replace(at, state=_hold_tip(at, predicted, measured))
+        return replace(at, state=_hold_tip(at, predicted, measured, points))
     if not at.correction.fits_start:
         return replace(at, state=_assimilate(at, predicted, measured))
     return _fit_start(at, predicted, measured[Y:] - predicted.tip[Y : Z + 1], noise)
@@ -193,9 +207,19 @@ def _as_point(values: Floats) -> Point:
     return x, y, z
 
 
-def _assimilate(at: Corrected, predicted: State, measured: Floats) -> State:
+def _assimilate(at: Corrected, predicted: State, measured: Floats, points: Sequence[Point] = ()) -> State:
+    """Return the state with the tip held where it was measured, and the needle at points in the tissue behind it."""
     axes = at.simulator.scenario.setup.axes
-    return at.simulator.assimilate(predicted, measured[: 1 + axes].tolist()).state
+    held: list[Point] = []
+    for point in sorted(points):
+        if (
+            max(0.0, held[-1][0] if held else 0.0) + _APART_MM
+            < point[0]
+            < float(predicted.tip[X]) - _APART_MM
+        ):
+            held.append(point)
+    inside = [point[: 1 + axes] for point in held]
+    return at.simulator.assimilate(predicted, measured[: 1 + axes].tolist(), inside).state
 
 
 def _correct_axially(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
@@ -268,9 +292,9 @@ def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: flo
     return float(simulator.step(moved, STILL).tip[Y] - state.tip[Y])
 
 
-def _hold_tip(at: Corrected, predicted: State, measured: Floats) -> State:
+def _hold_tip(at: Corrected, predicted: State, measured: Floats, points: Sequence[Point]) -> State:
     """Return the state with the tip held at its measured position and, if estimated, the low-passed load."""
-    held = _assimilate(at, predicted, measured)
+    held = _assimilate(at, predicted, measured, points)
     if not at.correction.estimates_load:
         return held
     gain = at.simulator.scenario.control.load_gain

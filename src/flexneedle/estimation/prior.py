@@ -23,8 +23,8 @@ class Slots(NamedTuple):
     """Places of the parameters.
 
     On each axis: base, slope, bend, run-out, and the tilt of a measured direction (the latter three relative to the
-    bevel's direction). Then the bevel factor, the clearance, and the first of the moduli. After the last of these, errors
-    of the tracker and of other sensors.
+    bevel's direction). Then the bevel factor, the clearance, and the first of the moduli. After the last of these,
+    errors of the tracker and of other sensors.
     """
 
     base: slice
@@ -50,7 +50,9 @@ class Slots(NamedTuple):
 
     def is_offset(self, parameter: int) -> bool:
         """Return whether a parameter is an error of a measurement, without effect on the needle."""
-        return self.run_out.start <= parameter < self.tilt.stop or self.end is not None and parameter >= self.end
+        return self.run_out.start <= parameter < self.tilt.stop or (
+            self.end is not None and parameter >= self.end
+        )
 
 
 LEAST_SD = 1e-6

@@ -263,7 +263,9 @@ def _make_period(
         },
         converged=state.converged and (truth is None or truth.converged),
         sensors=observation.sensors,
-        tip_covariance=_covariance(estimate) if task.scenario.sensor or task.scenario.tracker.bias_sd_mm else None,
+        tip_covariance=_covariance(estimate)
+        if task.scenario.sensor or task.scenario.tracker.bias_sd_mm
+        else None,
     )
 
 

@@ -1,5 +1,12 @@
-"""Readings of the sensors along the needle in the closed loop: read, check, and correct the estimate with the tip's."""
+"""Sensors along the needle in the closed loop: read, checked, excluded where they contradict the others.
 
+Where readings contradict the prediction, either of the sensors may be wrong, or the model. So the insertion is fitted
+again without the last readings of each sensor in turn. A sensor is excluded if the fit without it explains all others
+so much better that no chance explains it, and clearly better than the fit without any other sensor. If the tracker is
+the one, or it is not clear which, the needle is held.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -7,18 +14,37 @@ from typing import Any
 import numpy as np
 
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.loop.monitor.sensors import SensorMonitor, check_frozen, check_readings
+from flexneedle.estimation.identification import TRACKER
+from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
-from flexneedle.types import OK, SensorState, Verdict, VerdictKind, X
+from flexneedle.types import OK, Measurement, SensorState, Verdict, VerdictKind, X
+
+_STEPS = 12  # of the largest advance: readings of which are left out
+_GAIN = 12.0  # least fall of the cost of the fit without a faulty sensor
+_CLEAR = 5.0  # by which it must fall more than without any other sensor
+_OUTLYING = 0.5  # share of outliers in a period, which are no chance
 
 
 @dataclass(frozen=True)
 class Watch:
-    """The monitors of the sensors along the needle, by name."""
+    """The monitors of the tracker and of the sensors along the needle, by name."""
 
     monitors: Mapping[str, SensorMonitor] = field(default_factory=dict)
+
+    def of(self, name: str) -> SensorMonitor:
+        """Return the monitor of a sensor."""
+        return self.monitors.get(name, _NEW)
+
+    def change(self, name: str, monitor: SensorMonitor) -> "Watch":
+        """Return the watch with another state of a monitor."""
+        return Watch({**self.monitors, name: monitor})
+
+
+_NEW = SensorMonitor()
+NO_WATCH = Watch()
+"""Before the first reading."""
 
 
 def read_sensors(
@@ -30,48 +56,101 @@ def read_sensors(
     ports: Mapping[str, NeedleSensor],
 ) -> tuple[Watch, tuple[SensorState, ...]]:
     """Read the sensors along the needle, and check their readings beside the prediction."""
-    monitors, states = dict(watch.monitors), []
+    states = []
     for sensor in scenario.sensor:
         name = sensor.title
-        monitors[name], state = _read_sensor(
-            sensor, ports[name], monitors.get(name, SensorMonitor()), scenario, predicted, begun, now
-        )
-        states.append(state)
-    return replace(watch, monitors=monitors), tuple(states)
+        found = _read_sensor(sensor, ports[name].read(), watch.of(name), scenario, predicted, begun, now)
+        watch = watch.change(name, found[0])
+        states.append(found[1])
+    return watch, tuple(states)
 
 
 def _read_sensor(
     sensor: Sensor,
-    port: NeedleSensor,
+    readings: Sequence[Any],
     monitor: SensorMonitor,
     scenario: Scenario,
     predicted: Any,
     begun: float,
     now: float,
 ) -> tuple[SensorMonitor, SensorState]:
-    readings, name = port.read(), sensor.title
     if not readings:
-        return monitor, SensorState(name, verdict=monitor.excluded)
+        return monitor, SensorState(sensor.title, verdict=monitor.excluded)
     depth = float(predicted.state.tip[X])
-    for one in readings:
-        monitor = monitor.repeat(one, depth)
-    compared = predicted.compare(name, readings)
+    monitor = monitor.add(readings, depth)
+    compared = predicted.compare(sensor.title, readings)
     max_age = scenario.control.stale_after_s + now - begun + sensor.delay_s + 3.0 * sensor.delay_sd_s
     checked = check_readings(readings, compared, now, max_age)
-    frozen = check_frozen(monitor, depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
-    verdict = monitor.excluded if not monitor.excluded.ok else frozen
-    good = [one.verdict.ok for one in checked]
-    state = SensorState(name, checked, verdict, compared.nis(good) if any(good) else float("nan"))
-    return replace(monitor, excluded=verdict), state
+    good = np.array([one.verdict.ok for one in checked])
+    outlying = np.array([one.verdict.kind is VerdictKind.OUTLIER for one in checked])
+    # Where most are outliers, they are no chance: the sensor is faulty, or the prediction is wrong.
+    judged = good | outlying if outlying.sum() > _OUTLYING * (good | outlying).sum() else good
+    nis = compared.nis(judged) if judged.any() else math.nan
+    monitor = monitor.innovate(nis)
+    if monitor.excluded.ok:
+        frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
+        monitor = replace(monitor, excluded=frozen)
+    return monitor, SensorState(sensor.title, checked, monitor.excluded, nis)
 
 
-def check_uncertain(scenario: Scenario, estimate: Any, states: Sequence[SensorState], tracker: str) -> Verdict:
+def watch_tracker(predicted: Any, watch: Watch, good: Sequence[Measurement]) -> Watch:
+    """Return the watch with the innovation of good readings of the tracker."""
+    nis = predicted.compare_tip(good) if good else math.nan
+    return watch.change(TRACKER, watch.of(TRACKER).innovate(nis))
+
+
+def exclude_faulty(
+    scenario: Scenario, estimate: Any, watch: Watch, states: Sequence[SensorState], before: Watch
+) -> tuple[Any, Watch, tuple[SensorState, ...], Verdict]:
+    """Return estimate, watch and states after an exclusion, and a verdict: not OK if the needle must be held.
+
+    before: the watch of the period before, to see which sensors have been found frozen since.
+    """
+    since = _time_of_depth(estimate, scenario)
+    for one in states:
+        if not one.verdict.ok and before.of(one.name).excluded.ok:  # frozen
+            return estimate.without(one.name, since), watch, tuple(states), OK
+    names = [TRACKER, *(one.name for one in states)]
+    active = [name for name in names if watch.of(name).excluded.ok and estimate.count_values(name, since)]
+    if not any(watch.of(name).suspicious for name in active):
+        return estimate, watch, tuple(states), OK
+    now = estimate.cost
+    fits = {name: estimate.without(name, since) for name in active}
+    gains = {name: now - fits[name].cost - 0.5 * estimate.count_values(name, since) for name in active}
+    first, *others = sorted(active, key=lambda name: -gains[name])
+    if gains[first] < _GAIN:
+        return estimate, watch, tuple(states), OK
+    if others and gains[first] - gains[others[0]] < _CLEAR:
+        reason = f"{first} and {others[0]} contradict each other"
+        return estimate, watch, tuple(states), Verdict(VerdictKind.CONTRADICTED, reason)
+    nis = watch.of(first).nis
+    reason = f"innovations {math.sqrt(sum(nis) / max(1, len(nis))):.1f} times their standard deviation"
+    verdict = Verdict(VerdictKind.CONTRADICTED, reason)
+    watch = watch.change(first, replace(watch.of(first), excluded=verdict))
+    if first == TRACKER:
+        held = Verdict(VerdictKind.CONTRADICTED, f"tracker: {reason}, by the other sensors")
+        return fits[first], watch, tuple(states), held
+    after = tuple(replace(one, verdict=verdict) if one.name == first else one for one in states)
+    cleared = {name: replace(watch.of(name), nis=()) for name in active if name != first}
+    return fits[first], Watch({**watch.monitors, **cleared}), after, OK
+
+
+def _time_of_depth(estimate: Any, scenario: Scenario) -> float:
+    """Return the time (s) at which the tip was some steps less deep than now."""
+    depth = float(estimate.tips[-1, X]) - _STEPS * scenario.setup.max_advance_mm
+    k = int(np.searchsorted(np.maximum.accumulate(estimate.tips[1:, X]), depth))
+    return float(estimate.moves[min(k, len(estimate.moves) - 1)].motion.begun)
+
+
+def check_uncertain(
+    scenario: Scenario, estimate: Any, states: Sequence[SensorState], tracker: str
+) -> Verdict:
     """Require a tip that is known well enough, by all sensors together; tracker: its verdict in words."""
     sd, limit = tip_sd(estimate), scenario.control.tip_sd_limit
     if sd <= limit:
         return OK
-    states_of = [f"{one.name}: {one.verdict}" for one in states]
-    reason = f"known to ± {sd:.2f} mm across, limit {limit:.2f} mm (tracker: {tracker}; {'; '.join(states_of)})"
+    known = "; ".join(f"{one.name}: {one.verdict}" for one in states)
+    reason = f"known to ± {sd:.2f} mm across, limit {limit:.2f} mm (tracker: {tracker}; {known})"
     return Verdict(VerdictKind.UNCERTAIN, reason)
 
 

@@ -5,7 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.loop.fusing import Watch, check_uncertain, read_sensors
+from flexneedle.estimation.identification import TRACKER
+from flexneedle.loop.fusing import (
+    NO_WATCH,
+    Watch,
+    check_uncertain,
+    exclude_faulty,
+    read_sensors,
+    watch_tracker,
+)
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
 from flexneedle.ports import TipTracker
@@ -30,7 +38,7 @@ class Observation:
     measurement: Measurement = _NO_MEASUREMENT
     verdict: Verdict = OK
     field: bool = False
-    watch: Watch = Watch()
+    watch: Watch = NO_WATCH
     sensors: tuple[SensorState, ...] = ()
 
     def has_good_reading_after(self, time: float) -> bool:
@@ -84,10 +92,17 @@ def observe_all(
     if not scenario.sensor:
         return observe(scenario, predicted, before.monitor, begun, now, rig.tracker)
     watch, sensors = read_sensors(scenario, predicted, before.watch, begun, now, rig.sensors)
+    trusted = watch.of(TRACKER).excluded.ok
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
-    tracker = found.verdict if scenario.tracker.enabled else Verdict(VerdictKind.MISSING, "there is none")
-    verdict = check_uncertain(scenario, found.estimate, sensors, str(tracker))
-    return replace(found, verdict=verdict, field=False, watch=watch, sensors=sensors)
+    good = [one.measurement for one in found.readings if one.verdict.ok] if trusted else []
+    watch = watch_tracker(predicted, watch, good)
+    estimate, watch, sensors, verdict = exclude_faulty(scenario, found.estimate, watch, sensors, before.watch)
+    if not trusted:
+        verdict = watch.of(TRACKER).excluded
+    if verdict.ok:
+        tracker = found.verdict if scenario.tracker.enabled else Verdict(VerdictKind.MISSING, "there is none")
+        verdict = check_uncertain(scenario, estimate, sensors, str(tracker))
+    return replace(found, estimate=estimate, verdict=verdict, field=False, watch=watch, sensors=sensors)
 
 
 def observe(

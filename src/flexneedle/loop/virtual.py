@@ -176,8 +176,7 @@ def to_stage(registration: Registration | None) -> Rigid:
 def _noisy_tracker(
     scenario: Scenario, phantom: Phantom, bias: Point, wrong: Rigid, rng: np.random.Generator, drift: Point
 ) -> NoisyTracker:
-    """Return the tracker with white noise, a bias (mm), an error that grows to `drift` (mm) and a wrong registration."""
-
+    """Return the tracker with white noise, a bias and a growing error `drift` (mm), and a wrong registration."""
     lost, depth = scenario.phantom.tracker_lost_mm, scenario.target.depth_mm
 
     def tip_at(time: float) -> Point:

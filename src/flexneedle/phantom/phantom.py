@@ -170,7 +170,9 @@ class Phantom:
         if self._keeps_shapes:
             nodes = getattr(self._plant, "nodes", None)
             if nodes is None:
-                raise InputError(f"phantom = {type(self._plant).__name__}: without nodes no [[sensor]] can measure it")
+                raise InputError(
+                    f"phantom = {type(self._plant).__name__}: without nodes no [[sensor]] can measure it"
+                )
             before = self._shapes[-1][1] if self._shapes else self._plant.roll
             turned = math.remainder(self._plant.roll - before, 2.0 * math.pi)
             self._shapes.append((time, before + turned, to_poses(nodes)))

@@ -6,7 +6,7 @@ import numpy as np
 
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.scenario.sensors.sensor import Fault, Sensor, turn
-from flexneedle.types import VISIBLE, Floats, Needles, Reading, X
+from flexneedle.types import VISIBLE, Floats, Matrix, Needles, Reading, X
 
 
 class VirtualSensor:
@@ -22,11 +22,23 @@ class VirtualSensor:
     """
 
     def __init__(
-        self, sensor: Sensor, phantom: Phantom, axes: int, depth: float, length: float, rng: np.random.Generator
+        self,
+        sensor: Sensor,
+        phantom: Phantom,
+        axes: int,
+        depth: float,
+        length: float,
+        rng: np.random.Generator,
     ) -> None:
         # Each quantity has its own generator, so that a change of one does not change the others.
         places, errors, self._rng, faults = rng.spawn(4)
-        self._sensor, self._phantom, self._axes, self._depth, self._length = sensor, phantom, axes, depth, length
+        self._sensor, self._phantom, self._axes, self._depth, self._length = (
+            sensor,
+            phantom,
+            axes,
+            depth,
+            length,
+        )
         self._mounted = sensor.mounted(places)
         pairs = axes if sensor.paired else 1
         self._gain = 1.0 + np.repeat(errors.normal(0.0, sensor.gain_sd, sensor.size(axes) // pairs), pairs)
@@ -36,7 +48,8 @@ class VirtualSensor:
         self._clock = errors.uniform(-1.0, 1.0) * sensor.phantom.clock_s
         self._faulty_way = faults.choice([-1.0, 1.0], axes if sensor.paired else 1)
         self._wander = errors.normal(0.0, 1.0, self._offset.size)
-        self._taken, self._last = -1, None
+        self._taken = -1
+        self._last: Matrix | None = None
         self._lost = False
 
     @property
@@ -47,7 +60,7 @@ class VirtualSensor:
     def read(self) -> tuple[Reading, ...]:
         """Return the readings that arrived since the last call, oldest first."""
         period, now = 1.0 / self._sensor.rate_hz, self._phantom.now()
-        found = []
+        found: list[Reading] = []
         while True:
             time = (self._taken + 1) * period
             fault = self._fault_at(time)
@@ -62,8 +75,7 @@ class VirtualSensor:
     def _fault_at(self, time: float) -> Fault | None:
         """Return the fault, if it has begun."""
         fault = self._sensor.phantom.fault
-        begun = fault is not None and self._phantom.tip_at(time)[X] >= fault.depth_mm
-        return fault if begun else None
+        return fault if fault and self._phantom.tip_at(time)[X] >= fault.depth_mm else None
 
     def _measure(self, time: float, fault: Fault | None, stamp: float) -> Reading:
         errors, sensor = self._sensor.phantom, self._sensor
@@ -81,8 +93,8 @@ class VirtualSensor:
         share = fault.size if fault and fault.kind == "outliers" else errors.outlier_fraction
         if outlying < share:
             values += math.copysign(errors.outlier_size * sensor.noise, side - 0.5)
-        self._last = sensor.report(values, self._axes)
-        return Reading(stamp, self._last)
+        self._last = rows = sensor.report(values, self._axes)
+        return Reading(stamp, rows)
 
     def _step_wander(self) -> None:
         kept = math.exp(-1.0 / (self._sensor.rate_hz * self._sensor.wander_s))

@@ -95,6 +95,9 @@ class ControlSettings(Section):
 
     load_gain: Fraction = 0.3
     """Gain per period of the low-pass filter on the estimated tip load. Not used by `adaptive-mpc`."""
+    essential_points: bool = False
+    """Whether points of sensors `points` and `slice` in the tissue are essential conditions, as the measured tip is in
+    the paper. Not used by `adaptive-mpc`, which fits all sensors."""
     depth_tolerance_mm: Positive = 0.01
     """Distance from the target depth at which the insertion ends."""
     start_offset_sd_mm: NonNegative = 0.5
@@ -113,8 +116,8 @@ class ControlSettings(Section):
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
     """Probability of a miss beyond `miss_limit_mm` from which the needle is held."""
     tip_sd_limit_mm: Positive | None = None
-    """Standard deviation of the estimated tip across the needle from which it is held, with a `[[sensor]]`. Not set: half
-    of `miss_limit_mm`."""
+    """Standard deviation of the estimated tip across the needle from which it is held, with a `[[sensor]]`. Not set:
+    half of `miss_limit_mm`."""
     hold_limit_s: Positive = 1.0
     """Time without a valid reading, or without a path to the target, after which the insertion ends."""
     hold_total_s: Positive = 300.0

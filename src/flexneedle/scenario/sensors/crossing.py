@@ -32,7 +32,9 @@ def passed(along: "Floats", stations: "Floats", width: int) -> "Flags":
     return np.repeat(seen, width, axis=1)
 
 
-def to_stations(along: "Floats", across: "Floats", stations: "Floats", curve: tuple["Floats", "Floats"]) -> "Floats":
+def to_stations(
+    along: "Floats", across: "Floats", stations: "Floats", curve: tuple["Floats", "Floats"]
+) -> "Floats":
     """Return the values (s · c,) of points at the nearest stations, NaN where there are none.
 
     Points are shifted to their station along the predicted curve, and several are averaged. along (k,), across (k, c):

@@ -1,6 +1,7 @@
 """Fibre Bragg gratings along the needle: curvature at sites, in the frame that rolls with the needle."""
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -59,7 +60,7 @@ class Fbg(Sensor):
     @field_validator("sites_mm")
     @classmethod
     def _rise(cls, sites: tuple[float, ...]) -> tuple[float, ...]:
-        if any(later <= earlier for earlier, later in zip(sites, sites[1:], strict=False)):
+        if any(later <= earlier for earlier, later in pairwise(sites)):
             raise ValueError("must rise, from the tip on")
         return sites
 
@@ -114,7 +115,8 @@ class Fbg(Sensor):
 
     def model_error(self, planned: "Floats") -> "Floats":
         """Return standard deviations (d,), 1/mm: a constant, and a share of the curvature along the plan."""
-        return np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * np.sqrt(np.mean(planned**2, axis=0)))
+        found: Floats = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * np.sqrt(np.mean(planned**2, axis=0)))
+        return found
 
     def mounted(self, rng: np.random.Generator) -> Self:
         """Return the sensor with its sites displaced."""
@@ -137,4 +139,5 @@ def tilts_at(needles: Needles, distances: "Floats") -> "Floats":
     middle = 0.5 * (before + after)[..., THETA:]
     slope = ends + 6.0 * r * (1.0 - r) * (step[..., Y:] / step[..., :Y] - middle)
     steep = np.hypot(slope[..., :1], slope[..., 1:])
-    return slope * np.divide(np.arctan(steep), steep, out=np.ones_like(steep), where=steep > 0.0)
+    tilts: Floats = slope * np.divide(np.arctan(steep), steep, out=np.ones_like(steep), where=steep > 0.0)
+    return tilts

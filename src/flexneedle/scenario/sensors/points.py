@@ -63,7 +63,7 @@ class Points(Range):
 
     @property
     def stations(self) -> "Floats":
-        """x (s,) at which readings are compared; a point is shifted to the nearest along the predicted needle."""
+        """X (s,) at which readings are compared; a point is shifted to the nearest along the predicted needle."""
         return np.linspace(self.from_mm, self.to_mm, _STATIONS)
 
     @property

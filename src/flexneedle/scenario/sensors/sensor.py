@@ -4,9 +4,9 @@ A kind says what an error-free sensor measures on a needle, and how large the er
 
     (1 + g) e^(i(ρ − φ)) (q + q' p) + o + w + ε
 
-with the quantity q of the needle, its derivative q' to the places p of the sensor, gain error g, turn ρ, offset o, wander
-w (correlated over time) and white noise ε; φ is the angle of the needle for a sensor that rolls with it, else 0. Units
-of values are those that the kind chooses, the same in all of its methods.
+with the quantity q of the needle, its derivative q' to the places p of the sensor, gain error g, turn ρ, offset o,
+wander w (correlated over time) and white noise ε; φ is the angle of the needle for a sensor that rolls with it, else 0.
+Units of values are those that the kind chooses, the same in all of its methods.
 """
 
 from collections.abc import Sequence
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
+
 
 class Fault(Section):
     """Table `phantom.fault` of a `[[sensor]]`: a fault of the virtual sensor."""
@@ -146,7 +147,7 @@ class Sensor(Section):
         """Return standard deviations (d,) of the model's error in the mean of a move; planned (m, d): along a plan."""
         raise NotImplementedError
 
-    def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
+    def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":  # noqa: ARG002
         """Return the values (d,) of a reading, NaN where it has none; needle: as predicted at its time (m = 1).
 
         Raises ValueError, with the rule, for rows of another shape.
@@ -177,18 +178,24 @@ def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
         return np.full(size, np.nan)
     values: Floats = np.array(rows)[:, :axes].ravel()
     if values.size != size:
-        raise ValueError(f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}")
+        raise ValueError(
+            f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}"
+        )
     return values
 
 
 def turn(values: "Floats", facing: Any, axes: int) -> "Floats":
     """Return values (m, d), lateral pairs in space, turned by unit numbers (m,) or (): by their cosine in the plane."""
     if axes == 1:
-        return values * np.asarray(facing).real[..., None]
+        flat: Floats = values * np.asarray(facing).real[..., None]
+        return flat
     pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.asarray(facing)[..., None]
-    return np.stack([pairs.real, pairs.imag], axis=-1).reshape(values.shape)
+    turned: Floats = np.stack([pairs.real, pairs.imag], axis=-1).reshape(values.shape)
+    return turned
 
 
 def perturbed(values: Sequence[float], most: float, rng: np.random.Generator) -> list[float]:
     """Return values, each displaced by up to ±most."""
-    return (np.asarray(values) + rng.uniform(-most, most, len(values))).tolist()
+    return [
+        value + float(off) for value, off in zip(values, rng.uniform(-most, most, len(values)), strict=True)
+    ]

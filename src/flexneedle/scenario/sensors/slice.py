@@ -105,7 +105,9 @@ class Slice(Sensor):
         if not reading.rows:
             return np.full(axes, np.nan)
         if np.shape(reading.rows) != (1, 3):
-            raise ValueError(f"{len(reading.rows)} rows of {len(reading.rows[0])} numbers, expected one x, y, z")
+            raise ValueError(
+                f"{len(reading.rows)} rows of {len(reading.rows[0])} numbers, expected one x, y, z"
+            )
         return self._in_frame(np.array(reading.rows[0]))[1][:axes]
 
     def report(self, values: "Floats", axes: int) -> Matrix:

@@ -50,10 +50,22 @@ class View(Range):
             self.projection[2]
         )
         if depth.prod() <= 0.0:
-            refuse([Problem("projection", self.projection[2], "the insertion axis must be in front of the camera")])
+            refuse(
+                [
+                    Problem(
+                        "projection", self.projection[2], "the insertion axis must be in front of the camera"
+                    )
+                ]
+            )
         start, end = self._pixels(np.array([[self.from_mm, 0.0, 0.0], [self.to_mm, 0.0, 0.0]]))
         if np.linalg.norm(end - start) < 1.0:
-            refuse([Problem("projection", self.projection[0], "must show the insertion axis longer than a pixel")])
+            refuse(
+                [
+                    Problem(
+                        "projection", self.projection[0], "must show the insertion axis longer than a pixel"
+                    )
+                ]
+            )
         return self
 
     def _pixels(self, points: "Floats") -> "Floats":
