@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+import flexneedle
+from flexneedle.record.fields import page_values
 from flexneedle.record.results import RESULT_KEYS, insertion_result
 from flexneedle.record.sensor_results import sensor_results
 from flexneedle.types import OK, CheckedReading, Reading, Verdict, VerdictKind
@@ -56,3 +58,15 @@ def test_a_result_has_sensors_only_with_sensors():
     assert found["tip_sd_mm"] == pytest.approx([0.01, 0.02, 0.03])
     assert [one["name"] for one in found["sensors"]] == ["fbg", "slice"]
     assert found["sensors"][1]["excluded_mm"] is None
+
+
+def test_a_row_of_the_page_has_points_of_sensors_that_measure_positions():
+    scenario = flexneedle.load_scenario("phantom").with_values(
+        {"sensor": [{"kind": "fbg", "sites_mm": [11, 26]}, {"kind": "slice", "plane_mm": 20.0}]}
+    )
+    plan, last = replace(SENSED.plan, scenario=scenario), SENSED.periods[-1]
+    found = page_values(last, plan)
+    assert [one["points"] for one in found["sensors"]] == [[], [(20.0, last.true_tip.y + 0.1, 0.0)]]
+    assert [one["verdict"] for one in found["sensors"]] == [FROZEN, "ok"]
+    assert found["tip_covariance"] == last.tip_covariance
+    assert page_values(make_insertion().periods[0], plan)["sensors"] == []

@@ -28,6 +28,7 @@ from flexneedle.record.messages import (
     uncertain_pose,
     vector,
 )
+from flexneedle.record.sensor_results import page_sensors
 from flexneedle.results import Action, Period, Plan
 from flexneedle.types import COLUMNS as CONTROL
 from flexneedle.types import (
@@ -278,8 +279,10 @@ FIELDS: dict[str, PeriodField] = {
     ),
     "converged": PeriodField((("converged", _flag),)),
     "readings": PeriodField(page=("indicator", _largest_indicator)),
+    "sensors": PeriodField(page=("sensors", page_sensors)),
     "tip_covariance": PeriodField(
-        topics=(Topic(TIP_COVARIANCE, "geometry_msgs/msg/PoseWithCovarianceStamped", _make_uncertain_tip),)
+        topics=(Topic(TIP_COVARIANCE, "geometry_msgs/msg/PoseWithCovarianceStamped", _make_uncertain_tip),),
+        page=("tip_covariance",),
     ),
     "durations": PeriodField(page=("decide_ms", lambda one, _: 1e3 * one.durations.get("decide", 0.0))),
 }

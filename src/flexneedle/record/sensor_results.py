@@ -4,7 +4,9 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from flexneedle.results import Insertion, Period
+from flexneedle.results import Insertion, Period, Plan
+from flexneedle.scenario.sensors.points import Points
+from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.types import SensorState, VerdictKind
 
 
@@ -49,6 +51,25 @@ def sensor_values(insertion: Insertion) -> dict[str, Any]:
     results, sds = sensor_results(insertion), tip_sds(insertion)
     known = {} if sds is None else {"tip_sd_mm": list(sds)}
     return known | ({"sensors": [asdict(one) for one in results]} if results else {})
+
+
+def page_sensors(period: Period, plan: Plan) -> list[dict[str, Any]]:
+    """Return name, verdict, NIS and good points x, y, z (mm) of each sensor along the needle in a period."""
+    placed = (
+        []
+        if plan.scenario is None
+        else [one for one in plan.scenario.sensor if isinstance(one, Slice | Points)]
+    )
+    names = {one.title for one in placed}
+    return [
+        {
+            "name": state.name,
+            "verdict": str(state.verdict),
+            "nis": state.nis,
+            "points": [row for one in state.good for row in one.rows] if state.name in names else [],
+        }
+        for state in period.sensors
+    ]
 
 
 def _result(insertion: Insertion, name: str) -> SensorResult:
