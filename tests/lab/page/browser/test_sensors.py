@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from browser_checks import added, arrived
+from browser_checks import added, arrived, show
 from flexneedle.lab.page.protocol import RowsMessage
 from recorded_page import insertion, opening, row
 
@@ -14,6 +15,12 @@ pytestmark = pytest.mark.page
 SECTION, WORDS = "[data-panel=section]", "[aria-label='Sensors along the needle'] li"
 PERIOD = 50
 COVARIANCE = [[0.04, 0.03, 0.0], [0.03, 0.25, 0.1], [0.0, 0.1, 0.09]]
+IN_SPACE = """async () => {
+  const { scene } = (await import("/static/space.js")).spaceView();
+  const [points, region] = ["sensed", "tip region"].map((name) => scene.getObjectByName(name));
+  const shown = points.children.filter(({ visible }) => visible);
+  return [shown.map(({ position }) => position.toArray()), region.geometry.parameters.radius, region.matrix.toArray()];
+}"""
 REGION = """async ([matrix, across, up]) => {
   const { regionOf } = await import("/static/sensors.js");
   return regionOf({ tip_covariance: matrix }, across, up);
@@ -68,6 +75,23 @@ def test_points_and_region_are_drawn_and_named(page, server):
     assert "points of sensors" in page.locator(f"{SECTION} .legend li").all_text_contents()
     assert all(count > 4 for count in added(page, server, "--estimate", known()))
     assert "tip, 95 % region" in page.locator(f"{SECTION} .legend li").all_text_contents()
+
+
+def test_points_and_region_are_in_space(page, server):
+    """The ellipsoid has 95 % of the tips: its matrix is a root of the covariance, its radius χ² with three degrees."""
+    server.send(known())
+    show(page, "space")
+    page.wait_for_selector("[data-panel=space] .legend li")
+    arrived(page)
+    points, radius, matrix = page.evaluate(IN_SPACE)
+    assert points == [[20.0, 2.0, 1.0]] * 2  # of periods 44 and 48
+    assert radius**2 == pytest.approx(chi2.ppf(0.95, 3), rel=1e-3)
+    placed = np.reshape(matrix, (4, 4)).T
+    np.testing.assert_allclose(placed[:3, :3] @ placed[:3, :3].T, COVARIANCE, atol=1e-12)
+    np.testing.assert_allclose(placed[:3, 3], row(PERIOD)["estimate"])
+    server.send(known(row))
+    arrived(page)
+    assert page.evaluate(IN_SPACE)[0] == []
 
 
 @pytest.mark.parametrize(
