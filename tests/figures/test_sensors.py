@@ -12,7 +12,7 @@ from drawn import axes, lines, names, overlapping, unarranged
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.sensors import LIMIT, WINDOW, state_changes
 from flexneedle.loop.monitor import sensors as monitor
-from flexneedle.types import Reading
+from flexneedle.types import OK, CheckedReading, Reading
 from synthetic import make_insertion
 from synthetic_sensors import COVARIANCE, EXCLUDED_FROM, FROZEN, with_sensors
 
@@ -53,6 +53,22 @@ def test_measured_curvatures_are_turned_back_to_the_stage():
     assert {-1, 1} == set(turned.round())
     np.testing.assert_allclose(near.get_ydata()[still], (1e3 * turned * rows)[still])
     assert np.isnan(near.get_ydata()[~still]).all()
+
+
+def test_in_space_the_fibre_turns_with_the_needle():
+    """Where y of the fibre has turned by 0.7 rad towards z, a curvature along y has components cos and −sin of it."""
+    rows = ((2e-3 * np.cos(0.7), -2e-3 * np.sin(0.7)),) * 2
+    bent = (CheckedReading(Reading(0.1, rows), OK),)
+    periods = tuple(
+        replace(one, roll=0.7, sensors=(replace(one.sensors[0], readings=bent),)) for one in SENSED.periods
+    )
+    space = flexneedle.load_scenario("phantom3d").with_values(
+        {"sensor": [{"kind": "fbg", "sites_mm": [11, 26]}]}
+    )
+    with unarranged():
+        panels = axes(insertion_figure(space, replace(SENSED, periods=periods)), "fbg y", "fbg z")
+    for panel, expected in zip(panels, (2.0, 0.0), strict=True):
+        assert lines(panel, "_measured")[0].get_ydata()[0] == pytest.approx(expected)
 
 
 def test_predicted_curvatures_are_those_of_the_estimated_needle():
@@ -121,6 +137,21 @@ def test_a_sensor_without_a_reading_is_drawn():
     periods = tuple(replace(one, sensors=(state,)) for one, state in zip(SENSED.periods, lost, strict=True))
     with unarranged():
         insertion_figure(SCENARIO, replace(SENSED, periods=periods))
+
+
+def test_a_site_without_a_value_in_some_readings_has_the_mean_of_the_others():
+    first = SENSED.periods[0]
+    readings = tuple(
+        CheckedReading(Reading(0.1, ((value, 0.0), (np.nan, np.nan))), OK) for value in (1e-3, np.nan, 3e-3)
+    )
+    one = replace(first, sensors=(replace(first.sensors[0], readings=readings),))
+    with unarranged():
+        (panel,) = axes(
+            insertion_figure(SCENARIO, replace(SENSED, periods=(one, *SENSED.periods[1:]))), "fbg"
+        )
+    near, far = lines(panel, "_measured")
+    assert abs(near.get_ydata()[0]) == pytest.approx(2.0)
+    assert np.isnan(far.get_ydata()[0])
 
 
 def test_readings_without_rows_are_drawn():

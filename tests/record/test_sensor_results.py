@@ -69,4 +69,9 @@ def test_a_row_of_the_page_has_points_of_sensors_that_measure_positions():
     assert [one["points"] for one in found["sensors"]] == [[], [(20.0, last.true_tip.y + 0.1, 0.0)]]
     assert [one["verdict"] for one in found["sensors"]] == [FROZEN, "ok"]
     assert found["tip_covariance"] == last.tip_covariance
+    lost = CheckedReading(Reading(0.0, ((20.0, math.nan, 0.0), (20.0, 1.0, math.nan))), OK)
+    partly = replace(last, sensors=(replace(last.sensors[1], readings=(lost,)),))
+    assert page_values(partly, plan)["sensors"][0]["points"] == [
+        (20.0, 1.0, 0.0)
+    ]  # z of a needle in the plane
     assert page_values(make_insertion().periods[0], plan)["sensors"] == []

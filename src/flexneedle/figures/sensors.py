@@ -138,11 +138,13 @@ def _mean(period: Period, sensor: Sensor, axes: int) -> Floats:
     still = abs(period.applied.roll) + abs(period.applied.spin) < _TURNED
     states = _states(period, sensor) if still else ()
     good = [one.reading for state in states for one in state.readings if one.verdict.ok]
-    values = [flatten(one.rows, sensor.size(axes), axes) for one in good]
-    if not values:
-        return np.full(sensor.size(axes), np.nan)
-    mean: Floats = turn(np.mean(values, axis=0)[None], np.exp(1j * period.roll), axes)[0]
-    return mean
+    size = sensor.size(axes)
+    values = np.array([flatten(one.rows, size, axes) for one in good]).reshape(-1, size)
+    known = np.isfinite(values)
+    sums, counts = np.where(known, values, 0.0).sum(axis=0), known.sum(axis=0)
+    means = np.divide(sums, counts, out=np.full(size, np.nan), where=counts > 0)
+    turned: Floats = turn(means[None], np.exp(1j * period.roll), axes)[0]
+    return turned
 
 
 def _innovations(insertion: Insertion) -> DepthPanel:

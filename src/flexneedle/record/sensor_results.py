@@ -7,7 +7,7 @@ from typing import Any
 from flexneedle.results import Insertion, Period, Plan
 from flexneedle.scenario.sensors.points import Points
 from flexneedle.scenario.sensors.slice import Slice
-from flexneedle.types import SensorState, VerdictKind
+from flexneedle.types import Point, SensorState, VerdictKind
 
 
 @dataclass(frozen=True)
@@ -55,21 +55,25 @@ def sensor_values(insertion: Insertion) -> dict[str, Any]:
 
 def page_sensors(period: Period, plan: Plan) -> list[dict[str, Any]]:
     """Return name, verdict, NIS and good points x, y, z (mm) of each sensor along the needle in a period."""
-    placed = (
-        []
-        if plan.scenario is None
-        else [one for one in plan.scenario.sensor if isinstance(one, Slice | Points)]
-    )
-    names = {one.title for one in placed}
     return [
-        {
-            "name": state.name,
-            "verdict": str(state.verdict),
-            "nis": state.nis,
-            "points": [row for one in state.good for row in one.rows] if state.name in names else [],
-        }
+        {"name": state.name, "verdict": str(state.verdict), "nis": state.nis, "points": _points(state, plan)}
         for state in period.sensors
     ]
+
+
+def _points(state: SensorState, plan: Plan) -> list[Point]:
+    """Return the points (mm) that a sensor measured, none of a sensor that measures no positions."""
+    scenario = plan.scenario
+    kinds = [] if scenario is None else [one for one in scenario.sensor if one.title == state.name]
+    if scenario is None or not any(isinstance(one, Slice | Points) for one in kinds):
+        return []
+    rows = [
+        row
+        for one in state.good
+        for row in one.rows
+        if all(map(math.isfinite, row[: 1 + scenario.setup.axes]))
+    ]
+    return [(x, y, z if math.isfinite(z) else 0.0) for x, y, z in rows]
 
 
 def _result(insertion: Insertion, name: str) -> SensorResult:
