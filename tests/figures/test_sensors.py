@@ -56,7 +56,7 @@ def test_measured_curvatures_are_turned_back_to_the_stage():
 
 
 def test_in_space_the_fibre_turns_with_the_needle():
-    """Where y of the fibre has turned by 0.7 rad towards z, a curvature along y has components cos and −sin of it."""
+    """With the fibre turned by 0.7 rad towards z, a curvature along y has components cos and −sin of it."""
     rows = ((2e-3 * np.cos(0.7), -2e-3 * np.sin(0.7)),) * 2
     bent = (CheckedReading(Reading(0.1, rows), OK),)
     periods = tuple(
