@@ -232,7 +232,7 @@ def row(index):
         "energy_uj": 0.02 * index, "true_energy_uj": 0.021 * index,
         "miss_mm": (0.3 * (1 - index / PERIODS), -0.1), "miss_sd_mm": 0.5 * (1 - index / PERIODS) + 0.05,
         "clearance_mm": 6.0 - 0.05 * index, "true_clearance_mm": 5.9 - 0.05 * index,
-        "decide_ms": 12.0, "late": False, "warning": "",
+        "decide_ms": 12.0, "late": False, "warning": "", "sensors": [], "tip_covariance": None,
     }  # fmt: skip
 
 

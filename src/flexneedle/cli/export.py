@@ -1,4 +1,4 @@
-"""`flexneedle export`: control periods or tracker readings of a run as CSV."""
+"""`flexneedle export`: control periods, or readings of the tracker or of other sensors, of a run as CSV."""
 
 from __future__ import annotations
 
@@ -10,9 +10,18 @@ from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_note
 from flexneedle.errors import InputError
 
-_PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
+_STDOUT = "-"
+_TABLES = {
+    "csv": ("control periods", "periods.csv"),
+    "readings": ("tracker readings", "readings.csv"),
+    "sensors": ("readings of the sensors along the needle", "sensors.csv"),
+}
+"""Rows and default file by option."""
 _COLUMN_HELP = """
 --csv: one row per control period; columns as in flexneedle.to_dataframe.
+With sensors along the needle, the last columns are tip_sd_x_mm, tip_sd_y_mm,
+tip_sd_z_mm (sd of the estimated tip), and for each sensor NAME.nis (normalised
+square of the innovation, 1 on average) and NAME.verdict.
 --readings: one row per tracker reading.
   time_s, period, frame_number    time of measurement, control period of
                                   arrival, frame number of the tracker
@@ -25,6 +34,13 @@ _COLUMN_HELP = """
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
                                   the tracker, in the tracker frame
+--sensors: one row per reading of the sensors along the needle.
+  time_s, period, sensor          time of measurement, control period of
+                                  arrival, name of the sensor
+  verdict, status                 ok, or the reason for the rejection; ok, or
+                                  why the sensor has no value
+  rows                            what it measured, rows of numbers as
+                                  flexneedle.devices.Reading
 Unknown values are empty. A tracker without frames has no sensor columns. A dry
 run adds a last column dry_run, an insertion disturbed on the page (serve) a
 column disturbed.
@@ -37,7 +53,7 @@ def add_parser(commands: Commands) -> None:
     parser = add_command(
         commands,
         "export",
-        "export the control periods or the tracker readings of a run",
+        "export the control periods or the readings of a run",
         export,
         "flexneedle export runs/mine --csv",
         "flexneedle export runs/mine --readings - | head",
@@ -45,12 +61,9 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("run", metavar="RUN", type=expand_home, help="folder of the run")
     what = parser.add_mutually_exclusive_group()
-    for option, rows, default in (
-        ("--csv", "control periods", _PERIODS),
-        ("--readings", "tracker readings", _READINGS),
-    ):
+    for option, (rows, default) in _TABLES.items():
         what.add_argument(
-            option,
+            f"--{option}",
             nargs="?",
             const="",
             metavar="FILE",
@@ -60,15 +73,14 @@ def add_parser(commands: Commands) -> None:
 
 def export(args: argparse.Namespace) -> int:
     """Write the CSV file."""
-    from flexneedle.record.export import write_csv, write_readings
+    from flexneedle.record.export import write_csv, write_readings, write_sensor_readings
     from flexneedle.record.loading import load_insertion
 
-    if args.csv is None and args.readings is None:
-        raise InputError("--csv or --readings: one must be given")
-    if args.csv is not None:
-        write, name, default = write_csv, args.csv, _PERIODS
-    else:
-        write, name, default = write_readings, args.readings, _READINGS
+    writers = {"csv": write_csv, "readings": write_readings, "sensors": write_sensor_readings}
+    chosen = next((option for option in _TABLES if getattr(args, option) is not None), None)
+    if chosen is None:
+        raise InputError("--csv, --readings or --sensors: one must be given")
+    write, name, (_, default) = writers[chosen], getattr(args, chosen), _TABLES[chosen]
     insertion, note = load_insertion(args.run)
     if note:
         print_note(note)

@@ -52,10 +52,12 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("true tip to target", _number(result["true_error_mm"], "mm")),
         ("  measured", _number(result["residual_mm"], "mm")),
         ("  planned", _number(result["planned_error_mm"], "mm")),
+        *_tip_sd(insertion),
         *_registration(scenario, insertion),
         *_clearance(scenario, insertion),
         *out_of_reach_rows(scenario).items(),
         *_invasiveness(insertion),
+        *_sensors(insertion),
         ("control periods", str(result["steps"])),
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         *([("late decisions", str(insertion.late))] if insertion.late else []),
@@ -91,6 +93,25 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
         return []
     error = expected_error(scenario.tracker.registration, insertion.target)
     return [("  expected registration error", _number(error, "mm"))]
+
+
+def _tip_sd(insertion: Insertion) -> list[tuple[str, str]]:
+    from flexneedle.record.sensor_results import tip_sds
+
+    sds = tip_sds(insertion)
+    return (
+        [] if sds is None else [("  sd of the estimated tip", f"{', '.join(f'{sd:.3f}' for sd in sds)} mm")]
+    )
+
+
+def _sensors(insertion: Insertion) -> Iterator[tuple[str, str]]:
+    """Yield the row of each sensor along the needle, followed by its exclusion."""
+    from flexneedle.record.sensor_results import sensor_results
+
+    for one in sensor_results(insertion):
+        yield f"sensor {one.name}", one.summary
+        if one.excluded:
+            yield f"  excluded {one.excluded_mm:.1f} mm deep", one.excluded
 
 
 def _clearance(scenario: Scenario, insertion: Insertion) -> Iterator[tuple[str, str]]:

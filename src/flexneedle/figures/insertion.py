@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.figures import curves, scene, space, zones
+from flexneedle.figures import curves, scene, sensors, space, zones
 from flexneedle.figures.labels import name_parts
 from flexneedle.figures.layout import COLUMNS, fit, mosaic, short
 from flexneedle.figures.panels import ENERGY, DepthPanel, Line, draw_depths, draw_timeline
@@ -24,6 +24,7 @@ from flexneedle.types import Floats, X
 
 _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 _LONG = 0.5  # mm; shorter paths would be hidden below their ends
+_TALL = 1.3  # height of a panel of sensors, over the other panels
 _LINES = {1: 92, 2: 60}  # characters of a line of the verdict, by the number of lateral axes
 
 
@@ -31,8 +32,9 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     """Return the figure of an insertion with at least one period, finished or not."""
     field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)
     shown = _panels(scenario, insertion)
+    sensed = sensors.sensor_panels(scenario, insertion)
     with apply_style():
-        figure, axes = _sheet(scenario, insertion, list(shown), field=len(field) > 0)
+        figure, axes = _sheet(scenario, insertion, list(shown), list(sensed), field=len(field) > 0)
         sections = scene.sections(scenario)
         scenes = [axes[f"scene{end}"] for end in sections]
         for ax, view in zip(scenes, sections.values(), strict=True):
@@ -41,7 +43,8 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         scene.name_scenes(scenes, verdict, scene.color_of(insertion))
         if scenario.setup.axes == 2:
             _along(axes["along"], scenario, insertion)
-        draw_depths([axes[name] for name in shown], scenario, list(shown.values()))
+        panels = shown | sensed
+        draw_depths([axes[name] for name in panels], scenario, list(panels.values()))
         for end, view in sections.items():
             _close_up(axes[f"end{end}"], scenario, insertion, view)
         facts = _facts(insertion)
@@ -65,7 +68,7 @@ def _panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
 
 
 def _sheet(
-    scenario: Scenario, insertion: Insertion, panels: list[str], *, field: bool
+    scenario: Scenario, insertion: Insertion, panels: list[str], sensed: list[str], *, field: bool
 ) -> tuple[Figure, dict[str, Axes]]:
     if scenario.setup.axes == 1:
         scenes = [["scene", "scene"]]
@@ -76,11 +79,12 @@ def _sheet(
         ends = ["end y", "end y", *["."] * (len(panels) - 4), "end z", "end z"]
         below = [[name, end, end] for name, end in zip(panels, ends, strict=True)]
         heights, widths, tall = [1.6, 1.6], space.COLUMNS, 2.8
-    rows = [*scenes, *below, *([["field", *["."] * (len(widths) - 1)]] if field else [])]
-    heights = heights + [1.0] * (len(rows) - len(scenes))
+    alone = [*sensed, *(["field"] if field else [])]
+    rows = [*scenes, *below, *([name, *["."] * (len(widths) - 1)] for name in alone)]
+    heights = heights + [1.0] * len(below) + [_TALL if name in sensed else 1.0 for name in alone]
     target = f"target {scene.place(scenario, insertion.target)}"
     title = f"{short(scenario.name, 60)}: {target} (seed {insertion.seed}){zones.name_lost(scenario)}"
-    return mosaic(title, tall + 1.15 * len(rows), rows, heights, widths)
+    return mosaic(title, tall + 1.15 * (len(rows) + (_TALL - 1.0) * len(sensed)), rows, heights, widths)
 
 
 def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:
@@ -93,6 +97,8 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
     zones.draw_zones(ax, scenario, curves.last_shape(insertion), view)
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle", view)
     _paths(ax, insertion, view)
+    sensors.draw_tip_region(ax, insertion, view)
+    sensors.draw_points(ax, scenario, insertion, view)
     _rolls(ax, scenario, insertion, view, 4.0)
     zones.draw_nearest(ax, scenario, curves.known_shapes(insertion), curves.known_clearance(insertion), view)
     scene.draw_target(ax, plan.target, view)
@@ -128,6 +134,7 @@ def _along(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     if scenario.setup.has_guide:
         space.draw_guide_along(ax, travel[:, 1:])
     space.draw_along(ax, path, insertion.plan.tips)
+    sensors.draw_tip_region(ax, insertion, scene.ALONG, band=False)
     _rolls(ax, scenario, insertion, scene.ALONG, space.arrow_along(ax))
     scene.draw_target(ax, insertion.target, scene.ALONG)
 
@@ -164,7 +171,8 @@ def _deviation(scenario: Scenario, insertion: Insertion) -> DepthPanel:
         off, true = (curves.lateral_error(plan, points, axis) for points in (measured, truth))
         lines.append(Line(f"tracker{end}", measured[:, X], off, tone(MEASURED, axis), "o"))
         lines.append(Line(f"true{end}", truth[:, X], true, tone(TRUE, axis)))
-    return DepthPanel("Deviation from the plan (mm)", lines, 0.4)
+    bands = sensors.tip_bands(scenario, insertion)
+    return DepthPanel("Deviation from the plan (mm)", lines, 0.4, bands=bands)
 
 
 def _motion(scenario: Scenario, insertion: Insertion) -> DepthPanel:
@@ -254,6 +262,7 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) ->
     scene.tint_layers(ax, scenario)
     zones.draw_zones(ax, scenario, curves.last_shape(insertion), view, named=False)
     _paths(ax, insertion, view, scale=1.6)
+    sensors.draw_tip_region(ax, insertion, view)
     scene.draw_target(ax, target, view)
     if near and not insertion.hit:
         miss = np.array([tip, target])[:, view]

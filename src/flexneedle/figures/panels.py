@@ -9,20 +9,25 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
 from flexneedle.figures.scene import tint_layers
-from flexneedle.figures.style import BAD, QUIET, is_narrow, small
+from flexneedle.figures.style import BAD, BOX, QUIET, is_narrow, small
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
 _ANGLES = (15, 30, 45, 90, 180, 360, 720, 1440)  # distances of ticks at angles (degrees)
 _TICKS = 4
+_POINTS = ("o", "x")  # styles of lines that are points
 _ROW, _HANDLE = 56, 6  # characters: of a line of names above a panel, of the mark of a name
 ENERGY = "Energy stored in the tissue (µJ), ◇ peak"
+_FEW = 4  # names that fit beside a panel
 _VISIBLE = 0.008  # least extent of a visible line, as a share of the panel's width
 
 
 @dataclass(frozen=True)
 class Line:
-    """A curve y (k,) over depth or time x (k,) with its name and how it is drawn; style "o": as points."""
+    """A curve y (k,) over depth or time x (k,) with its name and how it is drawn.
+
+    style "o" or "x": as points. A name that begins with _ is not shown.
+    """
 
     name: str
     x: Floats
@@ -32,10 +37,41 @@ class Line:
 
 
 @dataclass(frozen=True)
+class Band:
+    """A band from `low` to `high` (k,) over depth x (k,) with its name."""
+
+    name: str
+    x: Floats
+    low: Floats
+    high: Floats
+    color: str
+
+
+@dataclass(frozen=True)
+class Level:
+    """A horizontal line with its name."""
+
+    y: float
+    name: str
+    color: str
+    style: str
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An event at a depth, with its text."""
+
+    x: float
+    text: str
+    color: str
+
+
+@dataclass(frozen=True)
 class DepthPanel:
     """Lines over the depth of the tip; the y axis spans at least `least`.
 
-    angles: the lines are angles in degrees; peaks: the largest value of each line is marked.
+    angles: the lines are angles in degrees; peaks: the largest value of each line is marked; log: the y axis is
+    logarithmic and begins at `least` or above.
     """
 
     title: str
@@ -43,6 +79,10 @@ class DepthPanel:
     least: float
     angles: bool = False
     peaks: bool = False
+    bands: Sequence[Band] = ()
+    levels: Sequence[Level] = ()
+    marks: Sequence[Mark] = ()
+    log: bool = False
 
 
 def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthPanel]) -> None:
@@ -71,10 +111,21 @@ def _draw_panel(ax: Axes, scenario: Scenario, panel: DepthPanel) -> None:
     """Draw a panel, each line with a dot at its end; a panel without visible lines gives the reason."""
     tint_layers(ax, scenario)
     ax.axvline(0.0, color="#8c5a36", linewidth=1.0, zorder=1)
-    ax.axhline(0.0, color=QUIET, linewidth=0.6, zorder=1)
+    if panel.log:
+        ax.set_yscale("log")
+    else:
+        ax.axhline(0.0, color=QUIET, linewidth=0.6, zorder=1)
+    for band in panel.bands:
+        ax.fill_between(
+            band.x, band.low, band.high, color=band.color, alpha=0.25, linewidth=0.0, label=band.name
+        )
+    for level in panel.levels:
+        ax.axhline(
+            level.y, color=level.color, linestyle=level.style, linewidth=0.8, zorder=2, label=level.name
+        )
     _draw_lines(ax, panel.title, panel.lines)
     for line in panel.lines:
-        if len(line.x) and line.style != "o":
+        if len(line.x) and line.style not in _POINTS:
             ax.plot(line.x[-1], line.y[-1], "o", color=line.color, markersize=3, zorder=3.5)
         if len(line.x) and panel.peaks:
             k = int(np.argmax(np.nan_to_num(line.y)))
@@ -82,10 +133,32 @@ def _draw_panel(ax: Axes, scenario: Scenario, panel: DepthPanel) -> None:
                 line.x[k], line.y[k], "D", color=line.color, markerfacecolor="white", markersize=4, zorder=3.6
             )
     _set_height(ax, panel)
+    _draw_marks(ax, panel.marks)
     if not any(_is_visible(line, float(np.ptp(ax.get_xlim()))) for line in panel.lines):
         middle: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "va": "center"}
         middle["bbox"] = {"facecolor": "white", "linewidth": 0.0, "pad": 1.5}
         ax.text(0.5, 0.75, _why_empty(panel.lines), color=QUIET, fontsize=small(), **middle)
+
+
+def _draw_marks(ax: Axes, marks: Sequence[Mark]) -> None:
+    """Draw a vertical line at each mark, its text beside it, towards the middle."""
+    middle = np.mean(ax.get_xlim())
+    for number, mark in enumerate(marks):
+        ax.axvline(mark.x, color=mark.color, linewidth=1.0, zorder=2)
+        side = -1 if mark.x > middle else 1
+        beside: dict[str, Any] = {
+            "xytext": (3 * side, -9 * number - 2),
+            "textcoords": "offset points",
+            "va": "top",
+        }
+        beside |= {
+            "ha": "left" if side > 0 else "right",
+            "color": mark.color,
+            "fontsize": small(),
+            "bbox": BOX,
+        }
+        made = ax.annotate(mark.text, (mark.x, 1.0), xycoords=ax.get_xaxis_transform(), zorder=4, **beside)
+        made.set_in_layout(False)  # a long one would make the panels narrow
 
 
 def draw_timeline(
@@ -105,11 +178,17 @@ def _draw_lines(ax: Axes, title: str, lines: Sequence[Line]) -> None:
     for line in drawn:
         ax.plot(line.x, line.y, line.style, color=line.color, markersize=2.4, zorder=3, label=line.name)
     ax.set_title(title)
-    ax.locator_params(axis="y", nbins=3 if is_narrow() else 4)
+    if ax.get_yscale() == "linear":
+        ax.locator_params(axis="y", nbins=3 if is_narrow() else 4)
     if drawn and is_narrow():
         _name_above(ax)
     elif drawn:
-        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=1.4)
+        many = (
+            {"labelspacing": 0.2, "borderaxespad": 0.0}
+            if len(ax.get_legend_handles_labels()[1]) > _FEW
+            else {}
+        )
+        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=1.4, **many)
 
 
 def _name_above(ax: Axes) -> None:
@@ -128,7 +207,7 @@ def _name_above(ax: Axes) -> None:
 
 
 def _is_visible(line: Line, width: float) -> bool:
-    return len(line.x) > 0 and bool(line.style == "o" or np.ptp(line.x) >= _VISIBLE * width)
+    return len(line.x) > 0 and bool(line.style in _POINTS or np.ptp(line.x) >= _VISIBLE * width)
 
 
 def _why_empty(lines: Sequence[Line]) -> str:
@@ -139,7 +218,14 @@ def _why_empty(lines: Sequence[Line]) -> str:
 
 
 def _set_height(ax: Axes, panel: DepthPanel) -> None:
-    values = np.concatenate([[0.0], *(line.y for line in panel.lines)])
+    if panel.log:
+        ax.yaxis.set_major_formatter("{x:g}")
+        values = np.concatenate([[level.y for level in panel.levels], *(line.y for line in panel.lines)])
+        positive = values[values > 0.0]
+        ax.set_ylim(0.7 * max(panel.least, float(positive.min())), 1.6 * float(positive.max()))
+        return
+    bands = (side for band in panel.bands for side in (band.low, band.high))
+    values = np.concatenate([[0.0], *(line.y for line in panel.lines), *bands])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     pad = max(0.1 * (high - low), (panel.least - (high - low)) / 2)
     bottom = -0.04 * panel.least if low == 0.0 and high > 0.0 else low - pad

@@ -1,19 +1,24 @@
 """An insertion as CSV or DataFrame: columns with units, one row per period or reading, numbers with all digits."""
 
 import csv
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from typing import IO, TYPE_CHECKING, Any
 
 from flexneedle.arguments import check_instance
 from flexneedle.errors import InputError
 from flexneedle.record import readings
 from flexneedle.record.fields import COLUMNS, to_row, to_values
+from flexneedle.record.sensors import reading_values
 from flexneedle.results import Insertion, Period
+from flexneedle.types import SensorState
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
+_SENSOR_READING = ("time_s", "period", "sensor", "verdict", "status", "rows")
+_TIP_SD = ("tip_sd_x_mm", "tip_sd_y_mm", "tip_sd_z_mm")
 _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")
 
 
@@ -31,8 +36,9 @@ def to_dataframe(insertion: Insertion) -> "DataFrame":
     except ModuleNotFoundError:
         raise InputError("to_dataframe needs pandas, which is not installed: pip install pandas") from None
     marked = mark_columns(checked)
-    rows = [to_values(period) | marked for period in checked.periods]
-    return DataFrame(rows, columns=[*COLUMNS, *marked])
+    known = sensor_columns(checked)
+    rows = [to_values(period) | sensor_values(period, known) | marked for period in checked.periods]
+    return DataFrame(rows, columns=[*COLUMNS, *known, *marked])
 
 
 def mark_columns(insertion: Insertion) -> dict[str, Any]:
@@ -41,12 +47,28 @@ def mark_columns(insertion: Insertion) -> dict[str, Any]:
     return {name: True for name, marked in found.items() if marked}
 
 
+def sensor_columns(insertion: Insertion) -> list[str]:
+    """Return the columns that sensors along the needle add: sd of the estimated tip, NIS and verdict of each sensor."""
+    sds = _TIP_SD if any(period.tip_covariance is not None for period in insertion.periods) else ()
+    names = dict.fromkeys(state.name for period in insertion.periods for state in period.sensors)
+    return [*sds, *(f"{name}.{part}" for name in names for part in ("nis", "verdict"))]
+
+
+def sensor_values(period: Period, columns: Iterable[str]) -> dict[str, Any]:
+    """Return the values of such columns in a period, NaN if unknown."""
+    covariance = period.tip_covariance
+    sds = {} if covariance is None else {name: math.sqrt(covariance[k][k]) for k, name in enumerate(_TIP_SD)}
+    values = {f"{one.name}.nis": one.nis for one in period.sensors}
+    verdicts = {f"{one.name}.verdict": str(one.verdict) for one in period.sensors}
+    return dict.fromkeys(columns, math.nan) | sds | values | verdicts
+
+
 def write_csv(file: IO[str], insertion: Insertion) -> None:
     """Write periods to a text file opened with newline="". Wall-clock durations are only in the trace."""
-    marked = mark_columns(insertion)
-    writer = csv.DictWriter(file, [*COLUMNS, *marked], lineterminator="\n")
+    marked, known = mark_columns(insertion), sensor_columns(insertion)
+    writer = csv.DictWriter(file, [*COLUMNS, *known, *marked], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(to_row(period) | marked for period in insertion.periods)
+    writer.writerows(to_row(period) | sensor_values(period, known) | marked for period in insertion.periods)
 
 
 def write_readings(file: IO[str], insertion: Insertion) -> None:
@@ -68,6 +90,25 @@ def write_readings(file: IO[str], insertion: Insertion) -> None:
     writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(rows)
+
+
+def write_sensor_readings(file: IO[str], insertion: Insertion) -> None:
+    """Write all readings of the sensors along the needle, one line per reading, to a text file opened with newline="".
+
+    The column `rows` has what was measured, as `Reading.rows`: numbers separated by spaces, rows by semicolons.
+    """
+    marked = mark_columns(insertion)
+    writer = csv.DictWriter(file, [*_SENSOR_READING, *marked], lineterminator="\n")
+    writer.writeheader()
+    for period in insertion.periods:
+        for state in period.sensors:
+            writer.writerows(row | marked for row in _reading_rows(period.index, state))
+
+
+def _reading_rows(period: int, state: SensorState) -> Iterator[dict[str, Any]]:
+    for one in state.readings:
+        where = {"period": period, "sensor": state.name, "verdict": str(one.verdict)}
+        yield where | reading_values(one.reading)
 
 
 def _sensors(periods: Iterable[Period]) -> list[str]:

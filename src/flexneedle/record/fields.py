@@ -17,7 +17,18 @@ from typing import Any
 import numpy as np
 
 from flexneedle.loop.monitor.rules import has_indicator
-from flexneedle.record.messages import Message, joints, number, path, points, pose, table, vector
+from flexneedle.record.messages import (
+    Message,
+    joints,
+    number,
+    path,
+    points,
+    pose,
+    table,
+    uncertain_pose,
+    vector,
+)
+from flexneedle.record.sensor_results import page_sensors
 from flexneedle.results import Action, Period, Plan
 from flexneedle.types import COLUMNS as CONTROL
 from flexneedle.types import (
@@ -39,6 +50,7 @@ _POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "s
 _NUMBER, _VECTOR = "std_msgs/msg/Float64", "geometry_msgs/msg/Vector3Stamped"
 SHAPE, TRUE_SHAPE = "/needle/shape", "/needle/true_shape"
 PREDICTED, PREDICTED_SD = "/needle/predicted_shape", "/needle/predicted_sd"
+TIP_COVARIANCE = "/tip/covariance"
 _Parser = Callable[[str], Any]
 
 
@@ -97,6 +109,11 @@ def _make_measured(period: Period) -> Message | None:
     if x is None or y is None or not (isfinite(x) and isfinite(y)):
         return None
     return pose(period.measurement.time, Pose(x, y, z or 0.0, 0.0, 0.0))
+
+
+def _make_uncertain_tip(period: Period) -> Message | None:
+    covariance = period.tip_covariance
+    return None if covariance is None else uncertain_pose(period.time, period.estimate, covariance)
 
 
 def _measured_point(period: Period, _plan: Plan) -> Any:
@@ -262,10 +279,15 @@ FIELDS: dict[str, PeriodField] = {
     ),
     "converged": PeriodField((("converged", _flag),)),
     "readings": PeriodField(page=("indicator", _largest_indicator)),
+    "sensors": PeriodField(page=("sensors", page_sensors)),
+    "tip_covariance": PeriodField(
+        topics=(Topic(TIP_COVARIANCE, "geometry_msgs/msg/PoseWithCovarianceStamped", _make_uncertain_tip),),
+        page=("tip_covariance",),
+    ),
     "durations": PeriodField(page=("decide_ms", lambda one, _: 1e3 * one.durations.get("decide", 0.0))),
 }
 """Fields of `Period` by name, in the order of the columns. `true_…` are of the virtual phantom, which no controller
-knows. `record.topics` has durations and readings."""
+knows. `record.topics` has durations, readings and sensors along the needle."""
 
 _ADDED = {
     "stretch": "nan",

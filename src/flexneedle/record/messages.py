@@ -7,13 +7,13 @@ Time is the run's and starts at 0.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from math import cos, hypot, sin
+from math import cos, hypot, pi, sin
 
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 from rosbags.typesys import Stores, get_typestore
 
-from flexneedle.types import Floats, Point, Pose
+from flexneedle.types import Floats, Matrix, Point, Pose
 
 Time = ros.builtin_interfaces__msg__Time
 DiagnosticArray = ros.diagnostic_msgs__msg__DiagnosticArray
@@ -22,6 +22,8 @@ KeyValue = ros.diagnostic_msgs__msg__KeyValue
 PointMessage = ros.geometry_msgs__msg__Point
 PoseMessage = ros.geometry_msgs__msg__Pose
 PoseStamped = ros.geometry_msgs__msg__PoseStamped
+PoseWithCovariance = ros.geometry_msgs__msg__PoseWithCovariance
+PoseWithCovarianceStamped = ros.geometry_msgs__msg__PoseWithCovarianceStamped
 Quaternion = ros.geometry_msgs__msg__Quaternion
 Vector3 = ros.geometry_msgs__msg__Vector3
 Vector3Stamped = ros.geometry_msgs__msg__Vector3Stamped
@@ -35,6 +37,8 @@ Header = ros.std_msgs__msg__Header
 
 FRAME = "skin"
 JOINTS = ["base_x", "base_y", "base_z", "base_theta", "base_psi", "guide_y", "guide_z", "roll"]
+UNKNOWN_TURN = pi**2 / 3
+"""Variance (rad²) of an unknown angle, uniform over −π to π."""
 _METRES = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1e-3, 1e-3, 1.0])
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -48,7 +52,16 @@ class Check:
     values: Mapping[str, str]
 
 
-Message = PoseStamped | Path | JointState | Float64 | Float64MultiArray | Vector3Stamped | DiagnosticArray
+Message = (
+    PoseStamped
+    | PoseWithCovarianceStamped
+    | Path
+    | JointState
+    | Float64
+    | Float64MultiArray
+    | Vector3Stamped
+    | DiagnosticArray
+)
 
 
 def nanoseconds(time: float) -> int:
@@ -59,6 +72,14 @@ def nanoseconds(time: float) -> int:
 def pose(time: float, at: Pose) -> PoseStamped:
     """Return a pose at a time (s)."""
     return _pose_stamped(_header(time), at)
+
+
+def uncertain_pose(time: float, at: Pose, covariance: Matrix) -> PoseWithCovarianceStamped:
+    """Return a pose with the covariance (3, 3), mm², of its position; its orientation is unknown."""
+    matrix = UNKNOWN_TURN * np.eye(6)
+    matrix[:3, :3] = 1e-6 * np.array(covariance)
+    stamped = pose(time, at)
+    return PoseWithCovarianceStamped(stamped.header, PoseWithCovariance(stamped.pose, matrix.ravel()))
 
 
 def path(time: float, poses: Floats) -> Path:
@@ -114,7 +135,12 @@ def diagnostics(
 
 def statuses(time: float, name: str, checks: Iterable[Check]) -> DiagnosticArray:
     """Return a status for each check, all with the same name."""
-    return DiagnosticArray(_header(time), [_status(name, one) for one in checks])
+    return named_statuses(time, [(name, one) for one in checks])
+
+
+def named_statuses(time: float, checks: Iterable[tuple[str, Check]]) -> DiagnosticArray:
+    """Return a status for each check, with its name."""
+    return DiagnosticArray(_header(time), [_status(name, one) for name, one in checks])
 
 
 def _status(name: str, check: Check) -> DiagnosticStatus:

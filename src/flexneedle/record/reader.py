@@ -24,9 +24,15 @@ from flexneedle.record.messages import (
 )
 from flexneedle.record.messages import Path as PathMessage
 from flexneedle.record.readings import from_values
-from flexneedle.record.topics import READINGS, STATUS, TIMING, TOPICS
+from flexneedle.record.sensors import SensorRecord, restore
+from flexneedle.record.topics import READINGS, SENSOR_READINGS, SENSORS, STATUS, TIMING, TOPICS
 from flexneedle.results import Period
 from flexneedle.types import CheckedMeasurement, Floats, Shape, Z
+
+_READ = (
+    *(SHAPE, PREDICTED, PREDICTED_SD, TRUE_SHAPE),
+    *(READINGS, SENSOR_READINGS, SENSORS, TIMING, STATUS),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +85,8 @@ class _Collector:
         self._true_shape: Floats | None = None
         self._durations: dict[str, float] = {}
         self._readings: tuple[CheckedMeasurement, ...] = ()
+        self._sensor_readings: list[DiagnosticStatus] = []
+        self._sensors = SensorRecord()
 
     def add(self, record: McapRecord) -> None:
         """Add one record of the file."""
@@ -92,11 +100,12 @@ class _Collector:
             self.scenario = json.loads(record.data)
 
     def _add_message(self, topic: str, data: bytes) -> None:
-        if topic not in (SHAPE, PREDICTED, PREDICTED_SD, TRUE_SHAPE, READINGS, TIMING, STATUS):
+        if topic not in _READ:
             return
         message = STORE.deserialize_cdr(data, TOPICS[topic])
         if isinstance(message, PathMessage) and topic == SHAPE:
             self._shape, self._predicted, self._true_shape = poses_of(message), None, None
+            self._sensors = SensorRecord()
         elif isinstance(message, PathMessage) and topic == TRUE_SHAPE:
             self._true_shape = poses_of(message)[:, : Z + 1]
         elif isinstance(message, PathMessage):
@@ -109,10 +118,15 @@ class _Collector:
             self._readings = tuple(
                 from_values(dict(_pairs(status)), parse_verdict(status.message)) for status in message.status
             )
+        elif isinstance(message, DiagnosticArray) and topic == SENSOR_READINGS:
+            self._sensor_readings = message.status
+        elif isinstance(message, DiagnosticArray) and topic == SENSORS:
+            self._sensors = restore(message, self._sensor_readings)
         elif isinstance(message, DiagnosticArray):
             row = dict(_pairs(message.status[0]))
             period = from_row(row, self._shape, self._durations, self._readings)
-            self.periods.append(replace(period, predicted=self._predicted, true_shape=self._true_shape))
+            more = {"predicted": self._predicted, "true_shape": self._true_shape, **self._sensors._asdict()}
+            self.periods.append(replace(period, **more))
 
 
 def _pairs(status: DiagnosticStatus) -> Iterator[tuple[str, str]]:

@@ -25,7 +25,7 @@ def to_values(checked: CheckedMeasurement) -> dict[str, str]:
     matrices = (measurement.points or None, measurement.covariance, measurement.direction_covariance)
     for key, matrix in zip((_POINTS, _COVARIANCE, _DIRECTION_COVARIANCE), matrices, strict=True):
         if matrix is not None:
-            values[key] = "; ".join(" ".join(map(repr, row)) for row in matrix)
+            values[key] = matrix_text(matrix)
     if frame is not None:
         values |= {"frame_time_s": repr(float(frame.time)), "frame_number": str(frame.number)}
         for name, reading in frame.readings.items():
@@ -87,7 +87,14 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 
 def _matrix(values: Mapping[str, str], key: str) -> Any:
     """Return the rows of a text, None without one; `Measurement` checks their number and length."""
-    if key not in values:
-        return None
-    rows: Matrix = tuple(tuple(map(float, row.split())) for row in values[key].split(";"))
-    return rows
+    return parse_matrix(values[key]) if key in values else None
+
+
+def matrix_text(rows: Matrix) -> str:
+    """Return the rows of a matrix as exact text."""
+    return "; ".join(" ".join(repr(float(value)) for value in row) for row in rows)
+
+
+def parse_matrix(text: str) -> Matrix:
+    """Return the rows of a text; raises ValueError for other texts."""
+    return tuple(tuple(map(float, row.split())) for row in text.split(";"))

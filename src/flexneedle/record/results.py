@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from flexneedle.record.plain import plain
+from flexneedle.record.sensor_results import sensor_values
 from flexneedle.results import Insertion, Outcome, Period, Plan
 from flexneedle.types import X
 
@@ -261,7 +262,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
         "converged": row["unconverged_periods"] == 0,
         "seed": insertion.seed,
     }
-    result: dict[str, Any] = plain({key: values[key] for key in RESULT_KEYS})
+    result: dict[str, Any] = plain({key: values[key] for key in RESULT_KEYS} | sensor_values(insertion))
     return result
 
 

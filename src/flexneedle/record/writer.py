@@ -7,7 +7,7 @@ the periods of the last half minute.
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from flexneedle.errors import RecordError
 from flexneedle.interrupts import delay_signals
 from flexneedle.record.messages import STORE
-from flexneedle.record.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
+from flexneedle.record.topics import LATCHED, OPTIONAL, TOPICS, TopicMessage, period_messages, plan_message
 from flexneedle.results import Period, Plan
 
 # A period has about 10 kB; a chunk or buffer that fills up within a period would split it.
@@ -98,18 +98,26 @@ class TraceWriter:
         self._writer.add_metadata("flexneedle", dict(about))
         text = json.dumps(scenario, indent=1, ensure_ascii=False, allow_nan=False)
         self._writer.add_attachment(0, 0, "scenario.json", "application/json", text.encode())
-        schemas = {}
-        for kind in dict.fromkeys(TOPICS.values()):
-            definition, _ = STORE.generate_msgdef(kind, ros_version=2)
-            schemas[kind] = int(self._writer.register_schema(kind, "ros2msg", definition.encode()))
+        self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        for topic, kind in TOPICS.items():
+        self._register([topic for topic in TOPICS if topic not in OPTIONAL])
+
+    def _register(self, topics: Collection[str]) -> None:
+        """Register topics and their types; the types come first."""
+        for kind in dict.fromkeys(TOPICS[topic] for topic in topics):
+            if kind not in self._schemas:
+                definition, _ = STORE.generate_msgdef(kind, ros_version=2)
+                self._schemas[kind] = int(self._writer.register_schema(kind, "ros2msg", definition.encode()))
+        for topic in topics:
             qos = {"offered_qos_profiles": _LATCHED_QOS} if topic in LATCHED else {}
-            self._channels[topic] = int(self._writer.register_channel(topic, "cdr", schemas[kind], qos))
+            schema = self._schemas[TOPICS[topic]]
+            self._channels[topic] = int(self._writer.register_channel(topic, "cdr", schema, qos))
 
     def _write(self, messages: Iterable[TopicMessage]) -> None:
         """Write messages as one chunk and flush it."""
         for one in messages:
+            if one.topic not in self._channels:
+                self._register([one.topic])
             data = bytes(STORE.serialize_cdr(one.message, TOPICS[one.topic]))
             self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
         self._writer.flush()

@@ -25,7 +25,7 @@ from flexneedle.lab.ros.zones import make_clearance, make_zones
 from flexneedle.record.messages import STORE, pose
 from flexneedle.record.writer import TraceWriter
 from flexneedle.simulator.zones import NO_ZONES, zones_of
-from flexneedle.types import Measurement, Pose, Shape
+from flexneedle.types import Measurement, Pose, SensorState, Shape
 from synthetic import blind, make_periods, make_plan
 from zoned import HALF_SPACE, SPHERE, with_zones
 
@@ -176,6 +176,19 @@ def test_a_measured_tip_has_its_covariance():
     np.testing.assert_allclose(found[3:, 3:], UNKNOWN_TURN * np.eye(3))
     assert sent.pose.pose == pose(1.5, Pose(1.0, 2.0, 3.0, 0.1, 0.2)).pose
     assert sent.header.stamp.sec == 1
+
+
+def test_an_estimated_tip_with_sensors_has_its_covariance():
+    matrix = ((1e-2, 2e-3, 0.0), (2e-3, 4e-2, 0.0), (0.0, 0.0, 9e-2))
+    period = replace(PERIOD, tip_covariance=matrix, sensors=(SensorState("fbg", nis=1.5),))
+    sent = composed(period)
+    found = sent["tip_covariance"].pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(found[:3, :3], 1e-6 * np.array(matrix))
+    assert sent["tip_covariance"].pose.pose == sent["tip"].pose
+    assert [pair.value for one in sent["diagnostics"].status for pair in one.values if pair.key == "nis"] == [
+        "1.5"
+    ]
+    assert "tip_covariance" not in composed(PERIOD)
 
 
 def test_unknown_values_and_topics_that_a_profile_does_not_list_are_not_published():

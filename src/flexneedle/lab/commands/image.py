@@ -148,12 +148,13 @@ def _example(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     """Write files for 3D Slicer, or what else is exported."""
-    if args.slicer is None and args.csv is None and args.readings is None:
-        raise InputError("--csv, --readings or --slicer: one must be given")
+    has_table = any(table is not None for table in (args.csv, args.readings, args.sensors))
+    if args.slicer is None and not has_table:
+        raise InputError("--csv, --readings, --sensors or --slicer: one must be given")
     if args.slicer is None:
         return export(args)
-    if args.csv is not None or args.readings is not None:
-        raise InputError("--slicer: not with --csv or --readings: export one after the other")
+    if has_table:
+        raise InputError("--slicer: not with --csv, --readings or --sensors: export one after the other")
     from flexneedle.lab.images.slicer_scene import has_image, write_entries, write_scene
     from flexneedle.record.entries import read_entries
     from flexneedle.record.folder import read_run

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from flexneedle.lab.ros.profile import PlacedTopic, ShapeTopic, TopicProfile
 from flexneedle.lab.ros.records import JointTargets, RosClearance, RosZones
 from flexneedle.record.fields import FIELDS
 from flexneedle.record.messages import (
+    UNKNOWN_TURN,
     Check,
     DiagnosticArray,
     Header,
@@ -29,27 +29,27 @@ from flexneedle.record.messages import (
     PointMessage,
     PoseMessage,
     PoseStamped,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
     Time,
     nanoseconds,
     path,
     pose,
     statuses,
 )
-from flexneedle.record.topics import READINGS, STATUS, TIMING, plan_message, status_messages
+from flexneedle.record.topics import READINGS, SENSORS, STATUS, TIMING, plan_message, status_messages
 from flexneedle.results import Period, Plan
-from flexneedle.types import Floats, Measurement, Pose, X, Z
+from flexneedle.types import Floats, Matrix, Measurement, Pose, X, Z
 
 PoseArray = ros.geometry_msgs__msg__PoseArray
-PoseWithCovariance = ros.geometry_msgs__msg__PoseWithCovariance
-PoseWithCovarianceStamped = ros.geometry_msgs__msg__PoseWithCovarianceStamped
 PointStamped = ros.geometry_msgs__msg__PointStamped
 String = ros.std_msgs__msg__String
 
-UNKNOWN_TURN = pi**2 / 3
-"""Variance (rad²) of an unknown angle, uniform over −π to π."""
 _TRACED: dict[str, Callable[[Period], Any]] = {
     topic.name: topic.message for one in FIELDS.values() for topic in one.topics
 }
+_UNKNOWN_TURNS = UNKNOWN_TURN * np.eye(3)
+_STATES = (STATUS, READINGS, SENSORS, TIMING)
 # Rotation by the slopes θ (about z) and ψ (about −y).
 _AXIS_TURN = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -156,23 +156,41 @@ def _make_tip(composer: MessageComposer, period: Period) -> PoseStamped:
     return composer.make_pose("tip", period.time, _TRACED["/tip/estimate"](period).pose)
 
 
+def _make_tip_covariance(composer: MessageComposer, period: Period) -> PoseWithCovarianceStamped | None:
+    if period.tip_covariance is None:
+        return None
+    return _make_uncertain(composer, "tip_covariance", period.time, period.estimate, period.tip_covariance)
+
+
 def _make_measured(composer: MessageComposer, period: Period) -> PoseWithCovarianceStamped | None:
     found = period.measurement
     if found.covariance is None or found.x is None or found.y is None or not period.verdict.ok:
         return None
-    frame, (theta, psi) = composer.frames["measured_tip"], found.direction or (0.0, 0.0)
-    at = pose(found.time, Pose(found.x, found.y, found.z or 0.0, theta, psi)).pose
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3] = frame.map_covariance(1e-6 * np.array(found.covariance))
-    matrix[3:, 3:] = frame.map_turns(_make_turn_covariance(found))
-    message = PoseWithCovariance(frame.map_pose(at), matrix.ravel())
-    return PoseWithCovarianceStamped(composer.make_header("measured_tip", found.time), message)
+    at = Pose(found.x, found.y, found.z or 0.0, *(found.direction or (0.0, 0.0)))
+    turns = _make_turn_covariance(found)
+    return _make_uncertain(composer, "measured_tip", found.time, at, found.covariance, turns)
+
+
+def _make_uncertain(
+    composer: MessageComposer,
+    key: str,
+    time: float,
+    at: Pose,
+    covariance: Matrix,
+    turns: Floats = _UNKNOWN_TURNS,
+) -> PoseWithCovarianceStamped:
+    """Return a pose with the covariances of its position, mm², and of rotations about x, y, z, rad²."""
+    frame, matrix = composer.frames[key], np.zeros((6, 6))
+    matrix[:3, :3] = frame.map_covariance(1e-6 * np.array(covariance))
+    matrix[3:, 3:] = frame.map_turns(turns)
+    message = PoseWithCovariance(frame.map_pose(pose(time, at).pose), matrix.ravel())
+    return PoseWithCovarianceStamped(composer.make_header(key, time), message)
 
 
 def _make_turn_covariance(found: Measurement) -> Floats:
     """Return the covariance (3, 3), rad², of rotations about x, y, z."""
     if found.direction is None or found.direction_covariance is None:
-        return UNKNOWN_TURN * np.eye(3)
+        return _UNKNOWN_TURNS
     known: Floats = _AXIS_TURN.T @ np.array(found.direction_covariance) @ _AXIS_TURN
     known[0, 0] = UNKNOWN_TURN
     return known
@@ -267,7 +285,7 @@ def _make_rig_diagnostics(composer: MessageComposer, record: LinkState) -> Diagn
 
 def _make_period_diagnostics(composer: MessageComposer, period: Period) -> DiagnosticArray:
     found: dict[str, Any] = dict(status_messages(period))
-    every = [status for topic in (STATUS, READINGS, TIMING) for status in found[topic].status]
+    every = [status for topic in _STATES if topic in found for status in found[topic].status]
     named = [replace(status, name=f"flexneedle: {status.name}") for status in every]
     return DiagnosticArray(composer.make_header("diagnostics", period.time), named)
 
@@ -278,6 +296,7 @@ _BUILDERS: dict[type, dict[str, Callable[[MessageComposer, Any], Any]]] = {
         "shape": _make_shape,
         "predicted_shape": _make_predicted,
         "tip": _make_tip,
+        "tip_covariance": _make_tip_covariance,
         "measured_tip": _make_measured,
         "needle_pose": _make_needle_pose,
         "guide_pose": _make_guide_pose,

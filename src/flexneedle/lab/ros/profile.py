@@ -143,6 +143,8 @@ class PublishedTopics(Section):
     """Predicted needle at the target."""
     tip: PlacedTopic | None = None
     """Estimated tip."""
+    tip_covariance: PlacedTopic | None = None
+    """Estimated tip with the covariance of its position, with sensors along the needle."""
     measured_tip: PlacedTopic | None = None
     """Measured tip with its covariance, if the tracker reports a covariance."""
     plan: PlacedTopic | None = None
@@ -164,7 +166,7 @@ class PublishedTopics(Section):
     state: ProfileTopic | None = None
     """State of the rig in one word."""
     diagnostics: ProfileTopic | None = None
-    """State of the rig with its reason, and all scalars, readings and durations of each control period."""
+    """State of the rig with its reason, and all scalars, readings, durations and sensors of each control period."""
     joint_targets: ProfileTopic | None = None
     """Goals of the joints of a rig of topics."""
 
@@ -190,6 +192,7 @@ PUBLISHED: dict[str, str] = {
     "shape": "geometry_msgs/msg/PoseArray",
     "predicted_shape": "geometry_msgs/msg/PoseArray",
     "tip": "geometry_msgs/msg/PoseStamped",
+    "tip_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "measured_tip": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "plan": "nav_msgs/msg/Path",
     "markers": "visualization_msgs/msg/MarkerArray",

@@ -3,7 +3,7 @@
 import { make, shown } from "./dom.js";
 import { drawAxial, endsOf } from "./flat/axial.js";
 import { KEYS, Handles } from "./flat/handles.js";
-import { entriesOf, measuredTip, partsOf } from "./flat/parts.js";
+import { entriesOf, measuredEntries, partsOf } from "./flat/parts.js";
 import { mappingOf } from "./flat/plane.js";
 import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
@@ -33,7 +33,7 @@ export function mount(element, store, link) {
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
     const reached = drawAxial(pen, { width, height, map, scene, target, others, parts, ends, store });
-    showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached), others);
+    showLegend(legend, entriesOf([...parts, ...measuredEntries(store)], reached), others);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
   store.subscribe([...SHOWN, ...STEERING], () => stage.schedule());

@@ -3,6 +3,7 @@
 import { make } from "./dom.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { disturbForm } from "./insertion/disturb.js";
+import { followSensors } from "./insertion/sensors.js";
 import { inWords } from "./insertion/words.js";
 import { loadTable } from "./load.js";
 import { STEERING, allow, isCut, runs } from "./shown.js";
@@ -15,7 +16,9 @@ export function mount(element, store, link) {
   const disturb = disturbForm(store, link);
   const load = make("div");
   const decisions = make("div.decisions");
-  element.append(state, load, disturb, decisions);
+  const sensors = make("div");
+  element.append(state, load, disturb, sensors, decisions);
+  followSensors(sensors, store);
   followDecisions(decisions, store);
   store.subscribe(["insertion live", "rows live", "rig", "connection"], () => {
     const live = store.get("insertion live");

@@ -4,6 +4,7 @@ import { mount as mountAxial } from "./axial.js";
 import { make } from "./dom.js";
 import { unpacked } from "./frames.js";
 import { followDecisions } from "./insertion/decisions.js";
+import { followSensors } from "./insertion/sensors.js";
 import { inWords } from "./insertion/words.js";
 import { layOut } from "./layout.js";
 import { loadTable } from "./load.js";
@@ -47,7 +48,8 @@ function mountWords(element) {
     const run = store.get(`insertion ${of}`);
     if (run) element.append(make("p", {}, make("strong", {}, `${what}${run.name}.`), ` ${inWords(run)}`));
   }
-  const decisions = make("div.decisions");
-  element.append(...loadTable(Object.keys(RUNS).map((of) => store.get(`insertion ${of}`))), decisions);
+  const [sensors, decisions] = [make("div"), make("div.decisions")];
+  element.append(...loadTable(Object.keys(RUNS).map((of) => store.get(`insertion ${of}`))), sensors, decisions);
+  followSensors(sensors, store);
   followDecisions(decisions, store);
 }

@@ -4,11 +4,12 @@ import { boxOf } from "./box.js";
 import { button, make, shown } from "./dom.js";
 import { KEYS, Handles } from "./flat/handles.js";
 import { boundaryEdit, guideEdit, guideOf, layersOf } from "./flat/layers.js";
-import { entriesOf, measuredTip, partsOf } from "./flat/parts.js";
+import { entriesOf, measuredEntries, partsOf } from "./flat/parts.js";
 import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
 import { drawSection, outlineOf } from "./flat/section.js";
 import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
+import { pointEntries } from "./sensors.js";
 import { SHOWN, STEERING, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
 import { stillNote } from "./still.js";
 import { entryEdit, entryOf, shownNearest, shownZones, zoneEdit, zoneEntries } from "./zones.js";
@@ -89,7 +90,7 @@ class SectionView {
     const parts = partsOf(this.#store, scene);
     const [zones, near] = [shownZones(this.#store), shownNearest(this.#store)];
     const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, others, parts, outline, zones, near, store: this.#store });
-    showLegend(this.#legend, [...entriesOf([...parts, ...measuredTip(this.#store)], reached), ...zoneEntries(zones, near, scene.axes === 2)], others);
+    showLegend(this.#legend, [...entriesOf([...parts, ...measuredEntries(this.#store)], reached), ...pointEntries(this.#store), ...zoneEntries(zones, near, scene.axes === 2)], others);
     this.#handles.update(mayMove(this.#store) ? [...this.#handlesOf({ map, plane, layers, guide, target, height }), ...this.#zoneHandles({ map, plane, zones })] : []);
   }
 

@@ -3,6 +3,7 @@
 import { tipOf } from "../paths.js";
 import { rollOf } from "../planned.js";
 import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
+import { regionOf } from "../sensors.js";
 import { area, cross, disc, grid, inside, pointsOf, polyline } from "./pen.js";
 import { reachAt } from "./reach.js";
 
@@ -28,6 +29,7 @@ export function drawAxial(pen, { width, height, map, scene, target, others, part
     disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.5 });
     for (const part of parts) draw(pen, part, place, map);
     if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));
+    region(pen, map, row);
     if (scene.guide) guide(pen, place(0, ...(row?.guide ?? scene.guide.slice(1))));
     const needle = parts.find(({ text }) => text === "needle");
     if (needle) bevel(pen, place(...tipOf(needle.path)), rollOf(store, of));
@@ -59,6 +61,12 @@ function readings(pen, place, rows) {
   for (const each of rows) {
     if (isMeasured(each)) cross(pen, place(...each.measured), { tone: "--measured" });
   }
+}
+
+// The 95 % region of the tip.
+function region(pen, map, row) {
+  const corners = regionOf(row, [0, 0, 1], [0, 1, 0]);
+  if (corners.length) polyline(pen, corners.map(([z, y]) => [map.toX(row.estimate[2] + z), map.toY(row.estimate[1] + y)]), { tone: "--estimate", width: 1.25 });
 }
 
 function guide(pen, [x, y]) {

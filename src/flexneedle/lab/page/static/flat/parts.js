@@ -2,6 +2,7 @@
 
 import { first, pathAt, pathOfRows, ranksOf } from "../paths.js";
 import { foreseen, plannedPaths, sampledPaths } from "../planned.js";
+import { regionEntries } from "../sensors.js";
 import { isMeasured, shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
 
 const STALE = 0.35;
@@ -51,11 +52,11 @@ function tips(store, of) {
   ];
 }
 
-// Entry of the legend for the measured tip, if one was measured until the shown period.
-export function measuredTip(store) {
+// Entries of the legend for the measured tip, if one was measured until the shown period, and for the region of the tip.
+export function measuredEntries(store) {
   const row = shownRow(store);
   const some = row && store.get(`rows ${shownOf(store)}`).slice(0, row.index + 1).some(isMeasured);
-  return some ? [{ text: "measured tip", tone: "--measured", cross: true }] : [];
+  return [...(some ? [{ text: "measured tip", tone: "--measured", cross: true }] : []), ...regionEntries(store)];
 }
 
 function secondRun(store, radius) {

@@ -2,6 +2,7 @@
 
 import { cutAlong } from "../planned.js";
 import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
+import { regionOf, sensedPoints } from "../sensors.js";
 import { shadeOf } from "../theme.js";
 import { layersIn } from "./layers.js";
 import { FOOT, SIDE, area, cross, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
@@ -11,6 +12,7 @@ import { drawNearest, drawZones } from "./zones.js";
 
 const GUIDE = [6, 3.2]; // mm, length and width
 const NAMES = { top: 24, step: 13, rows: 4, gap: 4 }; // px, of the names of layers; thin ones are below each other
+const POINT = 2; // px, radius of a point of a sensor
 const UP = { "x–y": "y (mm)", "x–z": "z (mm)", target: "from the axis (mm)" };
 
 // The outline [[x, u], …] of the reach in a plane, none unless it is shown.
@@ -33,6 +35,8 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
     for (const part of parts) draw(pen, part, place, map);
     if (near) drawNearest(pen, near, place);
     if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);
+    for (const point of sensedPoints(store)) disc(pen, place(...point), POINT, { tone: "--measured", alpha: 0.6 });
+    drawRegion(pen, map, plane, row);
     if (isMeasured(row)) cross(pen, place(...row.measured), { tone: "--measured" });
     for (const { name, position } of others) drawOther(pen, map, plane, name, position);
     drawTarget(pen, map, plane, target);
@@ -56,6 +60,15 @@ const upward = (name, map) => [UP[name], stretchIn(map)].filter(Boolean).join(",
 function drawTarget(pen, map, plane, [x, y, z]) {
   const radii = [map.sx, map.sy].map((scale) => Math.max(scale, 3));
   disc(pen, [map.toX(x), map.toY(lateral(plane, x, y, z))], radii, { tone: "--target", alpha: 0.85 });
+}
+
+// The 95 % region of the tip.
+function drawRegion(pen, map, plane, row) {
+  const [e, slope] = [plane.e, plane.slope];
+  const corners = regionOf(row, [1, 0, 0], [-e[0] * slope[0] - e[1] * slope[1], ...e]);
+  if (!corners.length) return;
+  const [x, u] = [row.estimate[0], lateral(plane, ...row.estimate)];
+  polyline(pen, corners.map(([right, up]) => [map.toX(x + right), map.toY(u + up)]), { tone: "--estimate", width: 1.25 });
 }
 
 // Another target, faint, with its name.

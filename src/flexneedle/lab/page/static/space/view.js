@@ -7,6 +7,7 @@ import { SHOWN, STEERING, otherTargets, shownOf, shownScene, shownTarget } from 
 import { Camera } from "./camera.js";
 import { Labels } from "./labels.js";
 import { Room } from "./room.js";
+import { Sensed } from "./sensed.js";
 import { Shapes } from "./shapes.js";
 import { Target } from "./target.js";
 import { Zones } from "./zones.js";
@@ -31,11 +32,12 @@ export class SpaceView {
     this.labels = new Labels();
     this.room = new Room(this.labels);
     this.shapes = new Shapes();
+    this.sensed = new Sensed();
     this.zones = new Zones();
     this.renderer.localClippingEnabled = true; // of zones, at the room
     this.target = new Target(this.camera, canvas, store, link, () => this.#schedule());
     this.scene = new Scene();
-    this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.zones.group, this.target.group, ...lights(this.camera.camera));
+    this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.sensed.group, this.zones.group, this.target.group, ...lights(this.camera.camera));
     new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
     new IntersectionObserver((entries) => this.#appear(entries.at(-1).isIntersecting)).observe(canvas);
     store.subscribe([...SHOWN, ...STEERING], () => this.#update());
@@ -51,7 +53,7 @@ export class SpaceView {
     const scene = shownScene(this.#store);
     if (!scene) return;
     this.#updateRoom(scene);
-    const entries = [...this.shapes.update(this.#store, scene, shownOf(this.#store)), ...this.zones.update(this.#store)];
+    const entries = [...this.shapes.update(this.#store, scene, shownOf(this.#store)), ...this.sensed.update(this.#store), ...this.zones.update(this.#store)];
     this.room.labelGuide(this.shapes.guide.position);
     showLegend(this.#legend, entries, otherTargets(this.#store));
     this.target.update();

@@ -1,0 +1,77 @@
+"""Results of sensors along the needle: shares, innovations, exclusion."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+import flexneedle
+from flexneedle.record.fields import page_values
+from flexneedle.record.results import RESULT_KEYS, insertion_result
+from flexneedle.record.sensor_results import sensor_results
+from flexneedle.types import OK, CheckedReading, Reading, Verdict, VerdictKind
+from synthetic import make_insertion
+from synthetic_sensors import EXCLUDED_FROM, FROZEN, with_sensors
+
+SENSED = with_sensors()
+OUTLIER = CheckedReading(Reading(0.0, ((1.0,),)), Verdict(VerdictKind.OUTLIER, "9 standard deviations"))
+MISSING = CheckedReading(Reading(0.0, ()), Verdict(VerdictKind.MISSING, "no value"))
+GOOD = CheckedReading(Reading(0.0, ((1.0,),)), OK)
+
+
+def fibre_with(*readings, verdicts=None):
+    """Return the result of the fibre with these readings in each period."""
+    periods = [replace(one, sensors=(replace(one.sensors[0], readings=readings),)) for one in SENSED.periods]
+    if verdicts is not None:
+        periods = [
+            replace(one, sensors=(replace(one.sensors[0], verdict=verdict),))
+            for one, verdict in zip(periods, verdicts, strict=False)
+        ]
+    return sensor_results(replace(SENSED, periods=tuple(periods)))[0]
+
+
+def test_readings_without_a_value_are_not_rejected():
+    found = fibre_with(GOOD, GOOD, OUTLIER, MISSING)
+    assert (found.readings, found.missing) == (4 * len(SENSED.periods), len(SENSED.periods))
+    assert found.rejected == pytest.approx(1 / 3)
+    assert fibre_with(MISSING).rejected == 0.0
+
+
+def test_the_innovation_is_the_mean_while_the_sensor_is_used():
+    found = sensor_results(SENSED)[0]
+    assert found.mean_nis == pytest.approx(0.1 * (EXCLUDED_FROM + 1) / 6)
+    assert found.excluded == FROZEN
+    assert found.excluded_mm == SENSED.periods[EXCLUDED_FROM].estimate.x
+
+
+def test_a_sensor_that_is_used_again_is_not_excluded():
+    bad = Verdict(VerdictKind.FROZEN, "the same")
+    again = fibre_with(GOOD, verdicts=[OK, bad, OK])
+    assert (again.excluded, math.isnan(again.excluded_mm)) == ("", True)
+    twice = fibre_with(GOOD, verdicts=[OK, bad, OK, bad, bad])
+    assert twice.excluded_mm == SENSED.periods[3].estimate.x
+
+
+def test_a_result_has_sensors_only_with_sensors():
+    assert set(insertion_result(make_insertion())) == set(RESULT_KEYS)
+    found = insertion_result(SENSED)
+    assert found["tip_sd_mm"] == pytest.approx([0.01, 0.02, 0.03])
+    assert [one["name"] for one in found["sensors"]] == ["fbg", "slice"]
+    assert found["sensors"][1]["excluded_mm"] is None
+
+
+def test_a_row_of_the_page_has_points_of_sensors_that_measure_positions():
+    scenario = flexneedle.load_scenario("phantom").with_values(
+        {"sensor": [{"kind": "fbg", "sites_mm": [11, 26]}, {"kind": "slice", "plane_mm": 20.0}]}
+    )
+    plan, last = replace(SENSED.plan, scenario=scenario), SENSED.periods[-1]
+    found = page_values(last, plan)
+    assert [one["points"] for one in found["sensors"]] == [[], [(20.0, last.true_tip.y + 0.1, 0.0)]]
+    assert [one["verdict"] for one in found["sensors"]] == [FROZEN, "ok"]
+    assert found["tip_covariance"] == last.tip_covariance
+    lost = CheckedReading(Reading(0.0, ((20.0, math.nan, 0.0), (20.0, 1.0, math.nan))), OK)
+    partly = replace(last, sensors=(replace(last.sensors[1], readings=(lost,)),))
+    assert page_values(partly, plan)["sensors"][0]["points"] == [
+        (20.0, 1.0, 0.0)
+    ]  # z of a needle in the plane
+    assert page_values(make_insertion().periods[0], plan)["sensors"] == []
