@@ -17,6 +17,8 @@ from flexneedle.estimation.moves import Move
 from flexneedle.scenario.sensors.sensor import Sensor, turn
 from flexneedle.types import Flags, Floats, Needles
 
+DOUBT = 2.0
+"""Factor on the model's error where readings are compared with their predictions."""
 _ROUNDING_S = 1e-9
 
 
@@ -83,7 +85,9 @@ class Comparison:
 
     value: Floats  # (r, d), NaN where nothing was measured
     residual: Floats  # value minus prediction (r, d)
-    covariance: Floats  # of the prediction (d, d), with the model's error
+    covariance: (
+        Floats  # of the prediction (d, d), with twice the model's error, which lasts from reading to reading
+    )
     noise: float  # standard deviation of the white noise of a value
 
     @property
@@ -137,8 +141,8 @@ class SensorFit:
 
     def clock(self, parameters: Floats) -> float:
         """Return the clock error (s) of parameters (K,); 0 where it is not estimated."""
-        place = self.slots.clock
-        return 0.0 if place is None else float(parameters[place : place + 1].sum())
+        place: int | None = self.slots.clock
+        return 0.0 if place is None else float(parameters[place])
 
     @cached_property
     def _known(self) -> tuple[Floats, Floats]:

@@ -11,7 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from flexneedle.estimation.along import Bins, SensorFit, whiten
-from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, Simulated, adapt_models
+from flexneedle.estimation.fitted import (
+    TRACKER,
+    Fitted,
+    FittedInsertion,
+    Part,
+    Perturbed,
+    Simulated,
+    adapt_models,
+)
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
 from flexneedle.types import DB_X, Floats, Laterals, X, laterals
@@ -46,8 +54,12 @@ def improve_fit(fitted: Fitted) -> Fitted:
     gradient = (weighted @ left).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
     if fitted.along:
-        more, known = inform_along(fitted)
-        gradient, precision = gradient + more, precision + known
+        own = float(0.5 * (np.abs(left) ** 2 / variance).sum())
+        tip = Part(TRACKER, own, fitted.axes * len(left), (weighted @ left).real, precision - prior.precision)
+        parts = (tip, *inform_along(fitted))
+        gradient = gradient + sum(one.gradient for one in parts[1:])
+        precision = precision + sum(one.precision for one in parts[1:])
+        fitted = fitted.change(parts=parts)
     fitted = fitted.change(precision=precision)
     goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
 
@@ -145,19 +157,20 @@ class Whitening(NamedTuple):
         return np.concatenate([np.linalg.solve(self.lower, rows[:count]), rest])
 
 
-def inform_along(fitted: FittedInsertion) -> tuple[Floats, Floats]:
-    """Return what the sensors along the needle add to the gradient (K,) and to the precision (K, K)."""
-    gradient = np.zeros(fitted.parameters.size)
-    precision = np.zeros((gradient.size, gradient.size))
+def inform_along(fitted: FittedInsertion) -> Iterator[Part]:
+    """Yield what each sensor along the needle adds to cost, gradient and precision."""
     for k, one in enumerate(fitted.along):
+        cost, gradient = 0.0, np.zeros(fitted.parameters.size)
+        precision = np.zeros((gradient.size, gradient.size))
         bins, ends = fitted.bins[k], fitted.quantities[k]
         depth = fitted.depths(bins)
         slopes = fitted.along_slopes(depth, k)
         jacobian = one.jacobian(bins, ends, depth, slopes, fitted.parameters, fitted.timeline)
         for left, rows in _whitened(one, bins, fitted.along_residuals[k], jacobian):
+            cost += 0.5 * float(left @ left)
             gradient += rows.T @ left
             precision += rows.T @ rows
-    return gradient, precision
+        yield Part(one.name, cost, int((bins.count > 0.0).sum()), gradient, precision)
 
 
 def cost_along(fitted: FittedInsertion) -> float:

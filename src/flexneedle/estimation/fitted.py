@@ -35,6 +35,20 @@ class Perturbed:
     state: State
 
 
+TRACKER = "tracker"
+"""Name of the tracker among the sensors."""
+
+
+class Part(NamedTuple):
+    """What a sensor adds to the cost of the fit, to its downhill gradient (K,), and to its second derivative (K, K)."""
+
+    name: str
+    cost: float
+    values: int  # number of its values
+    gradient: Floats
+    precision: Floats
+
+
 class Simulated(NamedTuple):
     """Insertions with P sets of parameters: their models, their states now, and tip poses (P, m + 1, 5)."""
 
@@ -70,6 +84,7 @@ class FittedInsertion:
     along: tuple[SensorFit, ...] = ()  # sensors along the needle
     quantities: tuple[Floats, ...] = ()  # their values (m + 1, d, 1 + p) at the ends of the moves
     along_curves: tuple[Floats, ...] = ()  # derivatives (K, g, d) of their values over the depths
+    parts: tuple[Part, ...] = ()  # of the last step of the fit, before it
     field_sd: float = 0.0  # of the tracker's error that is correlated along the path (mm)
 
     @property

@@ -22,7 +22,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from flexneedle.estimation.along import Comparison, SensorFit, SensorSlots
+from flexneedle.estimation.along import DOUBT, Comparison, SensorFit, SensorSlots
 from flexneedle.estimation.axial import (
     AS_COMMANDED,
     EvenAdvance,
@@ -43,7 +43,7 @@ from flexneedle.estimation.fit import (
     simulate_due,
     variance_of_rows,
 )
-from flexneedle.estimation.fitted import FittedInsertion
+from flexneedle.estimation.fitted import TRACKER, FittedInsertion, Part
 from flexneedle.estimation.lateral import components, directions, from_components, variance_of
 from flexneedle.estimation.moves import Move, assign_readings, position_along, tip_of
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
@@ -68,8 +68,6 @@ from flexneedle.types import (
 
 _DOUBTED = 3.5  # standard deviations
 _KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
-TRACKER = "tracker"
-"""Name of the tracker among the sensors."""
 _REFITS = 4  # steps of the fit after a sensor is excluded
 _KNOTS = 3  # of a drift, down to the target
 _RECENT = 12  # moves whose residuals are low-passed
@@ -303,7 +301,7 @@ class Identified(FittedInsertion):
         return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
 
     def without(self, name: str, since: float) -> "Identified":
-        """Return the estimate fitted again without the readings from a time (s) on of a sensor: `TRACKER` or its name."""
+        """Return the estimate fitted again without the readings of a sensor, or of the `TRACKER`, from a time (s) on."""
         if name == TRACKER:
             moves = tuple(done.without_readings(since) for done in self.moves)
             fitted = self.change(moves=moves)._fit_axially()
@@ -317,6 +315,29 @@ class Identified(FittedInsertion):
         left = fitted.residuals[0]
         inside = fitted.tips[-1, X] > 0.0
         return fitted.change(residual=low_pass(self.settings, fitted.without_field(left)) if inside else 0.0)
+
+    def conflict(self, name: str) -> float:
+        """Return the cost of the fit beyond those of a sensor alone and of all others alone, to second order.
+
+        About 0 or below for sensors that agree.
+        """
+        others = [one for one in self.parts if one.name != name]
+        alone = [one for one in self.parts if one.name == name]
+        return self._least_cost(self.parts) - self._least_cost(others) - self._least_cost(alone)
+
+    def misfit(self, name: str) -> float:
+        """Return the cost per value of a fit without a sensor, to second order; 0 if no other has values."""
+        others = [one for one in self.parts if one.name != name]
+        values = sum(one.values for one in others)
+        return self._least_cost(others) / values if values else 0.0
+
+    def _least_cost(self, parts: Sequence[Part]) -> float:
+        """Return the least cost of a fit to some sensors, to second order about the last step of the fit."""
+        off = self.parameters - self.prior.mean
+        gradient = sum((one.gradient for one in parts), -self.prior.precision @ off)
+        precision = sum((one.precision for one in parts), self.prior.precision)
+        fall = 0.5 * gradient @ np.linalg.solve(precision, gradient)
+        return sum(one.cost for one in parts) + self.prior.cost(self.parameters) - float(fall)
 
     @property
     def cost(self) -> float:
@@ -343,7 +364,7 @@ class Identified(FittedInsertion):
         parts = np.stack([slope.real, slope.imag])[: self.axes]
         scenario = self.nominal.scenario
         own = scenario.tracker.jitter_per_axis**2 / len(places) + self.field_sd**2
-        own += self.sensors[0].unexplained(scenario, self.settings) ** 2
+        own += (DOUBT * self.sensors[0].unexplained(scenario, self.settings)) ** 2
         known = parts @ self.covariance @ parts.T + own * np.eye(self.axes)
         return float(off @ np.linalg.solve(known, off)) / self.axes
 
@@ -359,7 +380,7 @@ class Identified(FittedInsertion):
         jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)[0]
         known = (
             jacobian @ self.covariance @ jacobian.T
-            + np.diag(one.model_sd**2)
+            + np.diag((DOUBT * one.model_sd) ** 2)
             + one.sensor.wander_sd**2 * np.eye(len(jacobian))
         )
         return Comparison(values, values - predicted, known, one.sensor.noise)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.identification import TRACKER
+from flexneedle.estimation.fitted import TRACKER
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
@@ -23,7 +23,8 @@ from flexneedle.types import OK, Measurement, SensorState, Verdict, VerdictKind,
 
 _STEPS = 12  # of the largest advance: readings of which are left out
 _GAIN = 40.0  # least fall of the cost of the fit without the last readings of a faulty sensor
-_CLEAR = 2.0  # ratio of the misfits of the others
+_SURE = 160.0  # fall of the cost with which some sensor is wrong, even if it is not clear which
+_CLEAR = 1.8  # ratio of the misfits of the others
 _OUTLYING = 0.5  # share of outliers in a period, which are no chance
 
 
@@ -135,14 +136,15 @@ def exclude_faulty(
 
 
 def _find_faulty(estimate: Any, active: Sequence[str], since: float) -> tuple[str, bool]:
-    """Return the sensor without which the others agree best, and True if it is clear; "" if no fault explains more.
+    """Return the sensor without which the others agree best, and True if it is clear; "" if none is found.
 
-    The last readings of a faulty sensor, from `since` (s) on, cost far more than a reading's share. Which sensor it is, is
-    told by the fits without each of them in the tissue: what is left agrees only without the faulty one.
+    The last readings of a faulty sensor, from `since` (s) on, cost far more than a reading's share. Which one it is, is
+    told by the fits without each of them in the tissue: what is left agrees only without the faulty one. While this is
+    not clear, the search goes on, up to a cost at which the needle must not move on.
     """
     counts = {name: estimate.count_values(name, since) for name in active}
     gains = [estimate.cost - estimate.without(name, since).cost - 0.5 * counts[name] for name in active]
-    if max(gains) < _GAIN:
+    if (most := max(gains)) < _GAIN:
         return "", False
     entry = _time_of_entry(estimate)
     whole = {name: estimate.count_values(name, entry) for name in active}
@@ -151,7 +153,8 @@ def _find_faulty(estimate: Any, active: Sequence[str], since: float) -> tuple[st
         others = sum(whole.values()) - whole[name]
         misfits[name] = estimate.without(name, entry).cost / others if others else 0.0
     first, *others = sorted(active, key=lambda name: misfits[name])
-    return first, not others or misfits[others[0]] > _CLEAR * misfits[first]
+    clear = not others or misfits[others[0]] > _CLEAR * misfits[first]
+    return (first if clear or most > _SURE else ""), clear
 
 
 def _time_of_entry(estimate: Any) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.identification import TRACKER
+from flexneedle.estimation.fitted import TRACKER
 from flexneedle.loop.fusing import (
     NO_WATCH,
     Watch,
