@@ -1,7 +1,7 @@
 """Fit of the sensors' errors, and of the needle's start, to a run in air.
 
-Least squares with normal priors over single readings: tracker and sensors are compared with the model's needle, which is
-simulated with the motions as they were carried out. The priors of the sensors' errors are wide; a quantity whose
+Least squares with normal priors over single readings: tracker and sensors are compared with the model's needle, which
+is simulated with the motions as they were carried out. The priors of the sensors' errors are wide; a quantity whose
 standard deviation stays near its prior is not found. Times are relative to the tracker's; without one, to the motors'.
 """
 
@@ -118,7 +118,7 @@ class AirModel:
         return replace(model, sensors=tuple(model._with_readings(one, shapes) for one in sensors))
 
     def _with_readings(self, one: SensorFit, shapes: Floats) -> SensorFit:
-        """Return a sensor with its readings; shapes (m + 1, n, 5): of the prior's needle, to which points are shifted."""
+        """Return a sensor with its readings; shapes (m + 1, n, 5): needle to which points are shifted."""
         given = self.run.readings[one.name]
         time = np.array([each.time for each in given])
         index, *_ = self.line.at(time)
@@ -161,7 +161,7 @@ class AirModel:
     def predict(
         self, parameters: Floats, tips: Floats, ends: Sequence[Floats]
     ) -> tuple[Floats, list[Floats]]:
-        """Return the readings of tracker (r, 1 + a) and sensors (r, d), from tips and quantities at the ends of moves."""
+        """Return readings of tracker (r, 1 + a) and sensors (r, d), from tips and quantities at the ends of moves."""
         slots, lag = self.slots, parameters[self.slots.lag]
         index, part, angle = self.line.at(self.tip_time - lag)
         axes = self.sensors[0].axes

@@ -10,6 +10,7 @@ from flexneedle.lab.rig.sensor_check.findings import keys_of
 from flexneedle.types import Floats
 
 _ROW = 2.1  # height of a row (inches)
+_NEAR_S = 0.1  # time over which a change counts, to both sides
 _ZOOM_S = 1.0  # to both sides
 
 
@@ -46,7 +47,9 @@ def _draw_sensor(whole: Axes, part: Axes, fit: AirFit, number: int, before: Floa
             )
         panel.set_xlabel("time (s)")
     whole.set(title=one.name, ylabel=f"value {column + 1} of {after.shape[1]} ({keys.unit})")
-    middle = time[kept][int(np.argmax(np.abs(np.gradient(after[kept, column], time[kept]))))]
+    seen, curve = time[kept], after[kept, column]
+    change = np.interp(seen + _NEAR_S, seen, curve) - np.interp(seen - _NEAR_S, seen, curve)
+    middle = seen[int(np.argmax(np.abs(change)))]
     near = np.abs(time - middle) < _ZOOM_S
     part.set_xlim(middle - _ZOOM_S, middle + _ZOOM_S)
     low, high = np.nanmin(value[near]), np.nanmax(value[near])
