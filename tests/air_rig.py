@@ -1,6 +1,5 @@
 """A needle in air between clamp and guide in closed form, with the ports of a rig, for the check of sensors."""
 
-
 import numpy as np
 
 from flexneedle import load_scenario
