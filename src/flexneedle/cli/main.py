@@ -25,7 +25,7 @@ _CORE = {"plan": plan, "insert": insert, "view": view, "export": export, "scenar
 _COLLECT_AFTER = 100_000  # new objects; with Python's 700, collections take a tenth of a short command's time
 _ORDER = (
     *("plan", "insert", "serve", "study", "report", "view", "export", "scenario", "image"),
-    *("import", "calibrate", "validate", "em", "rig", "emulate"),
+    *("import", "calibrate", "validate", "em", "rig", "sensor", "emulate"),
 )
 """Order in the help; commands of other packages, and options that a package adds to a command here, come last."""
 

@@ -12,7 +12,7 @@ from flexneedle.figures.curves import estimated_path, lateral_error
 from flexneedle.figures.layout import look, short
 from flexneedle.figures.panels import Band, DepthPanel, Level, Line, Mark
 from flexneedle.figures.scene import View, sections
-from flexneedle.figures.style import BAD, ESTIMATE, QUIET, is_column, tone
+from flexneedle.figures.style import ESTIMATE, QUIET, is_column, tone
 from flexneedle.results import Insertion, Period
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.fbg import Fbg
@@ -21,8 +21,7 @@ from flexneedle.scenario.sensors.sensor import Sensor, flatten, turn
 from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.types import Floats, Needles, SensorState, X, Y
 
-LIMIT, WINDOW = 2.0, 8
-"""Mean of normalised squares of the innovations that makes a sensor suspicious, and its periods, as of the monitor."""
+_WINDOW = 8  # periods of a running mean
 _REGION = math.sqrt(-2.0 * math.log(0.05))  # radius of the 95 % region in a plane, in standard deviations
 _BAND = 1.96
 _SHOWN_S = 2.0  # before the end: readings beside the needle as it is drawn
@@ -148,7 +147,7 @@ def _mean(period: Period, sensor: Sensor, axes: int) -> Floats:
 
 
 def _innovations(insertion: Insertion) -> DepthPanel:
-    """Return the normalised square of each sensor's innovation, its mean over the monitor's periods, and exclusions."""
+    """Return the normalised square of each sensor's innovation, its mean over some periods, and exclusions."""
     names = list(dict.fromkeys(state.name for period in insertion.periods for state in period.sensors))
     lines, marks = [], []
     for number, name in enumerate(names):
@@ -158,8 +157,8 @@ def _innovations(insertion: Insertion) -> DepthPanel:
         lines.append(Line("_used", found.depth[used], found.nis[used], color, "o"))
         lines.append(Line("_excluded", found.depth[~used], found.nis[~used], color, "x"))
         marks += [Mark(depth, text, color) for depth, text in state_changes(insertion, name)]
-    levels = [Level(1.0, "_expected", QUIET, "-"), Level(LIMIT, f"limit {LIMIT:g}", BAD, "--")]
-    title = f"Square of innovations (1 on average): ● used, × excluded, mean of {WINDOW}"
+    levels = [Level(1.0, "_expected", QUIET, "-")]
+    title = f"Square of innovations (1 on average): ● used, × excluded, mean of {_WINDOW}"
     return DepthPanel(title, lines, _LEAST_NIS, levels=levels, marks=marks, log=True)
 
 
@@ -177,7 +176,7 @@ def _running_mean(values: Floats) -> Floats:
     """Return the mean of each value (k,) and the ones before it within the window; NaN until it is full."""
     sums = np.cumsum(np.append(0.0, values))
     means = np.full(len(values), np.nan)
-    means[WINDOW - 1 :] = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
+    means[_WINDOW - 1 :] = (sums[_WINDOW:] - sums[:-_WINDOW]) / _WINDOW
     return means
 
 

@@ -1,14 +1,12 @@
 """The monitor of the sensors along the needle: verdicts on readings, and on each sensor.
 
-A reading far from its prediction is an outlier. A sensor whose readings are, on average over some periods, further from
-their predictions than both errors allow for may be faulty; then the fit decides which of the sensors is
-(`flexneedle.loop.fusing`).
+A reading far from its prediction is an outlier, and readings that repeat while the needle moves are frozen. A sensor that
+contradicts the others is found by the fit (`flexneedle.loop.fusing`).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 
 import numpy as np
 
@@ -17,22 +15,19 @@ from flexneedle.types import OK, VISIBLE, CheckedReading, Floats, Reading, Verdi
 
 _OUTLIER_SDS = 6.0
 _REPEATS = 10
-_WINDOW = 8  # periods
-_SUSPICIOUS = 1.7  # median of the normalised squares of the innovations: one surprise is none
 
 
 @dataclass(frozen=True)
 class SensorMonitor:
     """State of the monitor of one sensor. Frozen: each method returns the next state.
 
-    newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them; nis:
-    normalised squares of the innovations of the last periods; excluded: why the sensor does not count any more.
+    newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them;
+    excluded: why the sensor does not count any more.
     """
 
     newest: Reading | None = None
     repeats: int = 1
     since: float = 0.0
-    nis: tuple[float, ...] = ()
     excluded: Verdict = OK
 
     def add(self, readings: Sequence[Reading], depth: float) -> "SensorMonitor":
@@ -44,20 +39,6 @@ class SensorMonitor:
             elif one.rows:
                 state = replace(state, newest=one, repeats=1, since=depth)
         return state
-
-    def innovate(self, nis: float) -> "SensorMonitor":
-        """Return the state with the innovation of a period; NaN is none."""
-        return self if math.isnan(nis) else replace(self, nis=(*self.nis, nis)[-_WINDOW:])
-
-    @property
-    def suspicious(self) -> bool:
-        """True if the last innovations are improbably large."""
-        return len(self.nis) == _WINDOW and self.level > _SUSPICIOUS
-
-    @property
-    def level(self) -> float:
-        """Median of the normalised squares of the last innovations."""
-        return median(self.nis) if self.nis else 0.0
 
     def check_frozen(self, depth: float, travel_limit: float, resolution: float) -> Verdict:
         """Refuse readings that repeat while the tip travels, unless the sensor's values have steps."""
