@@ -10,8 +10,7 @@ from matplotlib.patches import Ellipse
 import flexneedle
 from drawn import axes, lines, names, overlapping, unarranged
 from flexneedle.figures.insertion import insertion_figure
-from flexneedle.figures.sensors import LIMIT, WINDOW, state_changes
-from flexneedle.loop.monitor import sensors as monitor
+from flexneedle.figures.sensors import _WINDOW, state_changes
 from flexneedle.types import OK, CheckedReading, Reading
 from synthetic import make_insertion
 from synthetic_sensors import COVARIANCE, EXCLUDED_FROM, FROZEN, with_sensors
@@ -83,21 +82,16 @@ def test_predicted_curvatures_are_those_of_the_estimated_needle():
         np.testing.assert_allclose(lines(panel, site)[0].get_ydata(), 2.0, rtol=1e-3)
 
 
-def test_innovations_are_over_the_depth_with_their_mean_and_the_limit():
+def test_innovations_are_over_the_depth_with_their_mean():
     (panel,) = axes(drawn(), "innovations")
     nis = np.array([period.sensors[0].nis for period in SENSED.periods])
     (mean,) = lines(panel, "fbg")
-    np.testing.assert_allclose(mean.get_ydata()[20], np.mean(nis[21 - WINDOW : 21]))
-    assert np.isnan(mean.get_ydata()[: WINDOW - 1]).all()
+    np.testing.assert_allclose(mean.get_ydata()[20], np.mean(nis[21 - _WINDOW : 21]))
+    assert np.isnan(mean.get_ydata()[: _WINDOW - 1]).all()
     used, _ = lines(panel, "_used")
     excluded = lines(panel, "_excluded")[0]
     assert (len(used.get_xdata()), len(excluded.get_xdata())) == (EXCLUDED_FROM, len(nis) - EXCLUDED_FROM)
-    assert list(lines(panel, f"limit {LIMIT:g}")[0].get_ydata()) == [LIMIT, LIMIT]
     assert panel.get_yscale() == "log"
-
-
-def test_the_limit_is_that_of_the_monitor():
-    pass
 
 
 def test_an_exclusion_is_marked_where_it_happened():

@@ -45,7 +45,7 @@ from flexneedle.estimation.fit import (
 )
 from flexneedle.estimation.fitted import TRACKER, FittedInsertion, Part
 from flexneedle.estimation.lateral import components, directions, from_components, variance_of
-from flexneedle.estimation.moves import Move, assign_readings, position_along, tip_of
+from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
@@ -301,7 +301,7 @@ class Identified(FittedInsertion):
         return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
 
     def without(self, name: str, since: float) -> "Identified":
-        """Return the estimate fitted again without the readings of a sensor, or of the `TRACKER`, from a time (s) on."""
+        """Return the estimate fitted again without the readings of a sensor, or the `TRACKER`, from a time (s) on."""
         if name == TRACKER:
             moves = tuple(done.without_readings(since) for done in self.moves)
             fitted = self.change(moves=moves)._fit_axially()
@@ -344,29 +344,6 @@ class Identified(FittedInsertion):
         """Negative logarithm of the posterior density, up to a constant."""
         variance = variance_of_rows(self)
         return cost_of(self, variance, Whitening.of(self, variance) if self.field_sd else None)
-
-    def count_values(self, name: str, since: float) -> int:
-        """Return the number of values of a sensor from a time (s) on: `TRACKER`, or its name."""
-        if name == TRACKER:
-            recent = [k for k, done in enumerate(self.moves) if done.motion.ended >= since]
-            return self.axes * int(np.isin(self.readings[0].index, recent).sum())
-        k = next(k for k, one in enumerate(self.along) if one.name == name)
-        bins = self.bins[k]
-        return int((bins.count[bins.time >= since] > 0.0).sum())
-
-    def compare_tip(self, measurements: Sequence[Measurement]) -> float:
-        """Return the normalised square of the mean lateral innovation of readings of the tip, 1 on average."""
-        places = [np.subtract(tip_of(one), self.tip_at(one.time))[1:] for one in measurements]
-        off = np.mean(places, axis=0)[: self.axes]
-        slope = self._tip_slope
-        if self.slots.bias.stop:
-            slope[self.slots.bias] = directions(1.0, self.axes)
-        parts = np.stack([slope.real, slope.imag])[: self.axes]
-        scenario = self.nominal.scenario
-        own = scenario.tracker.jitter_per_axis**2 / len(places) + self.field_sd**2
-        own += (DOUBT * self.sensors[0].unexplained(scenario, self.settings)) ** 2
-        known = parts @ self.covariance @ parts.T + own * np.eye(self.axes)
-        return float(off @ np.linalg.solve(known, off)) / self.axes
 
     def compare(self, name: str, readings: Sequence[Reading]) -> Comparison:
         """Return readings (r,) of a sensor along the needle beside their predictions."""

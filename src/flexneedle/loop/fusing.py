@@ -1,9 +1,7 @@
 """Sensors along the needle in the closed loop: read, checked, excluded where they contradict the others.
 
-Where readings contradict the prediction, either of the sensors may be wrong, or the model. So the insertion is fitted
-again without the last readings of each sensor in turn. A sensor is excluded if the fit without it explains all others
-so much better that no chance explains it, and clearly better than the fit without any other sensor. If the tracker is
-the one, or it is not clear which, the needle is held.
+A sensor that contradicts the others is excluded, and the insertion is fitted again without its last readings. If it is
+the tracker, or it is not clear which one is wrong, the needle is held.
 """
 
 import math
@@ -19,12 +17,13 @@ from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
-from flexneedle.types import OK, Measurement, SensorState, Verdict, VerdictKind, X
+from flexneedle.types import OK, SensorState, Verdict, VerdictKind, X
 
 _STEPS = 12  # of the largest advance: readings of which are left out
-_GAIN = 40.0  # least fall of the cost of the fit without the last readings of a faulty sensor
-_SURE = 160.0  # fall of the cost with which some sensor is wrong, even if it is not clear which
-_CLEAR = 1.8  # ratio of the misfits of the others
+_CONFLICT = 20.0  # cost by which sensors contradict each other
+_SURE = 2.0  # times that cost: one of them is wrong
+_CLEAR, _CLEARER = 2.5, 1.6  # ratios of the misfits without another sensor and without the faulty one
+_LEAST_MISFIT = 0.05  # cost per value of a fit that is good in any case
 _OUTLYING = 0.5  # share of outliers in a period, which are no chance
 
 
@@ -87,17 +86,10 @@ def _read_sensor(
     # Where most are outliers, they are no chance: the sensor is faulty, or the prediction is wrong.
     judged = good | outlying if outlying.sum() > _OUTLYING * (good | outlying).sum() else good
     nis = compared.nis(judged) if judged.any() else math.nan
-    monitor = monitor.innovate(nis)
     if monitor.excluded.ok:
         frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
         monitor = replace(monitor, excluded=frozen)
     return monitor, SensorState(sensor.title, checked, monitor.excluded, nis)
-
-
-def watch_tracker(predicted: Any, watch: Watch, good: Sequence[Measurement]) -> Watch:
-    """Return the watch with the innovation of good readings of the tracker."""
-    nis = predicted.compare_tip(good) if good else math.nan
-    return watch.change(TRACKER, watch.of(TRACKER).innovate(nis))
 
 
 def exclude_faulty(
@@ -111,56 +103,40 @@ def exclude_faulty(
     for one in states:
         if not one.verdict.ok and before.of(one.name).excluded.ok:  # frozen
             return estimate.without(one.name, since), watch, tuple(states), OK
-    names = [TRACKER, *(one.name for one in states)]
-    active = [name for name in names if watch.of(name).excluded.ok and estimate.count_values(name, since)]
-    if not any(watch.of(name).suspicious for name in active):
-        return estimate, watch, tuple(states), OK
-    first, clear = _find_faulty(estimate, active, since)
-    if not first:
-        return estimate, watch, tuple(states), OK
-    reason = f"its innovations are {math.sqrt(watch.of(first).level):.1f} times their standard deviation"
-    if first == TRACKER or not clear:
-        reason = f"{reason}, by the other sensors" if clear else "the sensors contradict each other"
-        verdict = Verdict(VerdictKind.CONTRADICTED, f"{first}: {reason}")
-        return (
-            estimate,
-            watch.change(TRACKER, replace(watch.of(TRACKER), excluded=verdict)),
-            tuple(states),
-            verdict,
-        )
-    verdict = Verdict(VerdictKind.CONTRADICTED, reason)
-    after = tuple(replace(one, verdict=verdict) if one.name == first else one for one in states)
-    monitors = {name: replace(watch.of(name), nis=()) for name in active}
-    monitors[first] = replace(watch.of(first), excluded=verdict)
-    return estimate.without(first, since), Watch({**watch.monitors, **monitors}), after, OK
+    active = [name for name in (TRACKER, *(one.name for one in states)) if watch.of(name).excluded.ok]
+    conflicts = {name: estimate.conflict(name) for name in active}
+    faulty, verdict = judge_conflict(conflicts, {name: estimate.misfit(name) for name in active})
+    if not faulty:
+        return estimate, watch, tuple(states), verdict
+    watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
+    if faulty == TRACKER:
+        return estimate, watch, tuple(states), verdict
+    after = tuple(replace(one, verdict=verdict) if one.name == faulty else one for one in states)
+    return estimate.without(faulty, since), watch, after, OK
 
 
-def _find_faulty(estimate: Any, active: Sequence[str], since: float) -> tuple[str, bool]:
-    """Return the sensor without which the others agree best, and True if it is clear; "" if none is found.
+def judge_conflict(conflicts: Mapping[str, float], misfits: Mapping[str, float]) -> tuple[str, Verdict]:
+    """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
-    The last readings of a faulty sensor, from `since` (s) on, cost far more than a reading's share. Which one it is, is
-    told by the fits without each of them in the tissue: what is left agrees only without the faulty one. While this is
-    not clear, the search goes on, up to a cost at which the needle must not move on.
+    Sensors that contradict each other cost the fit to all more than fits to each alone. What is left without the faulty
+    one agrees with the model, and what is left without another does not. While this is not clear the insertion goes on,
+    but not up to twice the limit of the cost. conflicts, misfits: of the sensors by name, as of an `Identified`.
     """
-    counts = {name: estimate.count_values(name, since) for name in active}
-    gains = [estimate.cost - estimate.without(name, since).cost - 0.5 * counts[name] for name in active]
-    if (most := max(gains)) < _GAIN:
-        return "", False
-    entry = _time_of_entry(estimate)
-    whole = {name: estimate.count_values(name, entry) for name in active}
-    misfits = {}
-    for name in active:
-        others = sum(whole.values()) - whole[name]
-        misfits[name] = estimate.without(name, entry).cost / others if others else 0.0
-    first, *others = sorted(active, key=lambda name: misfits[name])
-    clear = not others or misfits[others[0]] > _CLEAR * misfits[first]
-    return (first if clear or most > _SURE else ""), clear
-
-
-def _time_of_entry(estimate: Any) -> float:
-    """Return the time (s) at which the tip entered the tissue."""
-    inside = np.flatnonzero(estimate.tips[1:, X] > 0.0)
-    return float(estimate.moves[inside[0] if inside.size else -1].motion.begun)
+    most = max(conflicts.values(), default=0.0)
+    if most <= _CONFLICT:
+        return "", OK
+    first, *others = sorted(misfits, key=lambda name: misfits[name])
+    ratio = min((misfits[name] for name in others), default=math.inf) / max(misfits[first], _LEAST_MISFIT)
+    sure = most > _SURE * _CONFLICT
+    if ratio > (_CLEARER if sure else _CLEAR) or first == TRACKER:
+        reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:g}"
+        return first, Verdict(
+            VerdictKind.CONTRADICTED, f"{TRACKER}: {reason}" if first == TRACKER else reason
+        )
+    if not sure:
+        return "", OK
+    reason = f"{', '.join(misfits)} contradict each other, and it is not clear which is wrong"
+    return "", Verdict(VerdictKind.CONTRADICTED, reason)
 
 
 def _time_of_depth(estimate: Any, scenario: Scenario) -> float:

@@ -12,7 +12,6 @@ from flexneedle.loop.fusing import (
     check_uncertain,
     exclude_faulty,
     read_sensors,
-    watch_tracker,
 )
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
@@ -94,8 +93,6 @@ def observe_all(
     watch, sensors = read_sensors(scenario, predicted, before.watch, begun, now, rig.sensors)
     trusted = watch.of(TRACKER).excluded.ok
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
-    good = [one.measurement for one in found.readings if one.verdict.ok] if trusted else []
-    watch = watch_tracker(predicted, watch, good)
     estimate, watch, sensors, verdict = exclude_faulty(scenario, found.estimate, watch, sensors, before.watch)
     if not trusted:
         verdict = watch.of(TRACKER).excluded

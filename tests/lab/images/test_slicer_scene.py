@@ -191,7 +191,10 @@ def test_the_best_entries_of_an_image_are_on_its_skin(capsys, in_tmp):
         (("plan", "phantom3d", "--image", "case.toml"), "phantom3d: not with --image: write it in case.toml"),
         (("plan", "--image", "case.toml", "--target", "40", "1"), "--target: not with --image"),
         (("plan", "--image", "none.toml"), "none.toml: no such file"),
-        (("export", "run", "--slicer", "scene", "--csv"), "--slicer: not with --csv, --readings or --sensors"),
+        (
+            ("export", "run", "--slicer", "scene", "--csv"),
+            "--slicer: not with --csv, --readings or --sensors",
+        ),
         (("export", "run"), "--csv, --readings, --sensors or --slicer: one must be given"),
         (("export", "run", "--slicer", "scene"), "run: contains no run"),
     ],

@@ -1,7 +1,7 @@
 """The monitor of the sensors along the needle: verdicts on readings, and on each sensor.
 
-A reading far from its prediction is an outlier, and readings that repeat while the needle moves are frozen. A sensor that
-contradicts the others is found by the fit (`flexneedle.loop.fusing`).
+A reading far from its prediction is an outlier, and readings that repeat while the needle moves are frozen. A sensor
+that contradicts the others is found by the fit (`flexneedle.loop.fusing`).
 """
 
 import math
