@@ -19,6 +19,7 @@ from flexneedle.estimation.fitted import (
     Perturbed,
     Simulated,
     adapt_models,
+    kept_share,
 )
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
@@ -55,7 +56,16 @@ def improve_fit(fitted: Fitted) -> Fitted:
     precision = (weighted @ jacobian).real + prior.precision
     if fitted.along:
         own = float(0.5 * (np.abs(left) ** 2 / variance).sum())
-        tip = Part(TRACKER, own, fitted.axes * len(left), (weighted @ left).real, precision - prior.precision)
+        known = fitted.sensors[0].unexplained(fitted.nominal.scenario, fitted.settings) ** 2
+        model = np.full_like(variance, known)
+        tip = Part(
+            TRACKER,
+            own,
+            fitted.axes * len(left),
+            (weighted @ left).real,
+            precision - prior.precision,
+            kept_share(variance - model, model),
+        )
         parts = (tip, *inform_along(fitted))
         gradient = gradient + sum(one.gradient for one in parts[1:])
         precision = precision + sum(one.precision for one in parts[1:])
@@ -170,7 +180,10 @@ def inform_along(fitted: FittedInsertion) -> Iterator[Part]:
             cost += 0.5 * float(left @ left)
             gradient += rows.T @ left
             precision += rows.T @ rows
-        yield Part(one.name, cost, int((bins.count > 0.0).sum()), gradient, precision)
+        seen = bins.count > 0.0
+        model = np.broadcast_to(one.model_sd**2, seen.shape)[seen]
+        noise = one.sensor.noise**2 / bins.count[seen]
+        yield Part(one.name, cost, int(seen.sum()), gradient, precision, kept_share(noise, model))
 
 
 def cost_along(fitted: FittedInsertion) -> float:

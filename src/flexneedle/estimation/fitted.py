@@ -35,6 +35,8 @@ class Perturbed:
     state: State
 
 
+LASTING = 10.0
+"""Moves over which the model's error lasts."""
 TRACKER = "tracker"
 """Name of the tracker among the sensors."""
 
@@ -47,6 +49,18 @@ class Part(NamedTuple):
     values: int  # number of its values
     gradient: Floats
     precision: Floats
+    share: float  # of its weight that it keeps where the model's error lasts from move to move
+
+    def temper(self) -> "Part":
+        """Return the part with the weight that it has with a lasting error of the model."""
+        cost, gradient, precision = (self.share * one for one in (self.cost, self.gradient, self.precision))
+        return self._replace(cost=cost, gradient=gradient, precision=precision)
+
+
+def kept_share(noise: Floats, model: Floats) -> float:
+    """Return the mean share of their weight that means keep where the model's error lasts; of two variances (r,)."""
+    shares = (noise + model) / (noise + LASTING * model)
+    return float(shares.mean()) if shares.size else 1.0
 
 
 class Simulated(NamedTuple):

@@ -321,9 +321,10 @@ class Identified(FittedInsertion):
 
         About 0 or below for sensors that agree.
         """
-        others = [one for one in self.parts if one.name != name]
-        alone = [one for one in self.parts if one.name == name]
-        return self._least_cost(self.parts) - self._least_cost(others) - self._least_cost(alone)
+        parts = [one.temper() for one in self.parts]
+        others = [one for one in parts if one.name != name]
+        alone = [one for one in parts if one.name == name]
+        return self._least_cost(parts) - self._least_cost(others) - self._least_cost(alone)
 
     def misfit(self, name: str) -> float:
         """Return the cost per value of a fit without a sensor, to second order; 0 if no other has values."""
