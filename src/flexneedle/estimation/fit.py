@@ -181,7 +181,7 @@ def inform_along(fitted: FittedInsertion) -> Iterator[Part]:
             gradient += rows.T @ left
             precision += rows.T @ rows
         seen = bins.count > 0.0
-        model = np.broadcast_to(one.model_sd**2, seen.shape)[seen]
+        model = one.sensor.model_error(bins.value)[seen] ** 2
         noise = one.sensor.noise**2 / bins.count[seen]
         yield Part(one.name, cost, int(seen.sum()), gradient, precision, kept_share(noise, model))
 

@@ -53,8 +53,10 @@ class Part(NamedTuple):
 
     def temper(self) -> "Part":
         """Return the part with the weight that it has with a lasting error of the model."""
-        cost, gradient, precision = (self.share * one for one in (self.cost, self.gradient, self.precision))
-        return self._replace(cost=cost, gradient=gradient, precision=precision)
+        share = self.share
+        return self._replace(
+            cost=share * self.cost, gradient=share * self.gradient, precision=share * self.precision
+        )
 
 
 def kept_share(noise: Floats, model: Floats) -> float:

@@ -143,8 +143,8 @@ class Sensor(Section):
         """Return which values (m, d) the sensor can measure on needles (default: all)."""
         return np.ones((len(needles.points), self.size(axes)), dtype=bool)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,) of the model's error in the mean of a move; planned (m, d): along a plan."""
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d) of the model's error where these values (r, d) were measured."""
         raise NotImplementedError
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":  # noqa: ARG002
