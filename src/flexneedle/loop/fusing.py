@@ -20,7 +20,7 @@ from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, SensorState, Verdict, VerdictKind, X
 
 _STEPS = 12  # of the largest advance: readings of which are left out
-_CONFLICT = 20.0  # cost by which sensors contradict each other
+_CONFLICT = 6.0  # cost by which sensors contradict each other; healthy ones reach 5 in training worlds
 _SURE = 2.0  # times that cost: one of them is wrong
 _CLEAR, _CLEARER = 2.5, 1.6  # ratios of the misfits without another sensor and without the faulty one
 _LEAST_MISFIT = 0.05  # cost per value of a fit that is good in any case
