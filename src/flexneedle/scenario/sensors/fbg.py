@@ -115,7 +115,8 @@ class Fbg(Sensor):
 
     def model_error(self, values: "Floats") -> "Floats":
         """Return standard deviations (r, d), 1/mm: a constant, and a share of the curvature of the site."""
-        sites = values.reshape(len(values), len(self.sites_mm), -1)
+        count = len(self.sites_mm)
+        sites = values.reshape(len(values), count, values.shape[1] // count)
         size = np.sqrt((sites**2).sum(axis=2, keepdims=True))
         found = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * size)
         return np.broadcast_to(found, sites.shape).reshape(values.shape)
