@@ -107,7 +107,7 @@ class Identification:
             along=along,
             quantities=tuple(one.quantities(state.nodes[None], length) for one in along),
             along_curves=tuple(np.zeros((prior.mean.size, grid.size, one.size)) for one in along),
-            field_sd=scenario.tracker.field_sd_mm,
+            fields=((0.0, scenario.tracker.field_sd_mm),),
         )
         return differentiate(start, simulate_due(start, prior.mean, range(prior.mean.size)))
 
@@ -221,7 +221,7 @@ class Identified(FittedInsertion):
         columns, prior = np.stack([np.ones_like(travel), travel, moves_on]), axial_errors_prior(scenario)
         if len(prior) > len(columns):
             columns = np.concatenate([columns, np.ones_like(travel)[None]])
-        if self.field_sd:
+        if self.has_field:
             field = Whitening.of(self, variance)
             without, columns = field.of_rows(without), field.of_rows(columns.T).T
             variance = np.ones_like(variance)
@@ -275,9 +275,13 @@ class Identified(FittedInsertion):
         y, z = components(self.parameters[self.slots.bias]) if self.slots.bias.stop else (0.0, 0.0)
         return self.axial_bias, y, z
 
+    def with_field(self, sd: float, since: float) -> "Identified":
+        """Return the estimate with another standard deviation (mm) of the field's error, from a time (s) on."""
+        return self if sd == self.field_sd else self.change(fields=(*self.fields, (since, sd)))
+
     def without_field(self, left: Laterals) -> Laterals:
         """Return residuals (r,) of the tip's position without the known part of the field's error."""
-        if self.field_sd == 0.0:
+        if not self.has_field:
             return left
         field = Whitening.of(self, self.variances()[0])
         lower = field.lower
@@ -343,7 +347,7 @@ class Identified(FittedInsertion):
     def cost(self) -> float:
         """Negative logarithm of the posterior density, up to a constant."""
         variance = variance_of_rows(self)
-        return cost_of(self, variance, Whitening.of(self, variance) if self.field_sd else None)
+        return cost_of(self, variance, Whitening.of(self, variance) if self.has_field else None)
 
     def compare(self, name: str, readings: Sequence[Reading]) -> Comparison:
         """Return readings (r,) of a sensor along the needle beside their predictions."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.fitted import TRACKER
+from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
@@ -144,6 +145,16 @@ def _time_of_depth(estimate: Any, scenario: Scenario) -> float:
     depth = float(estimate.tips[-1, X]) - _STEPS * scenario.setup.max_advance_mm
     k = int(np.searchsorted(np.maximum.accumulate(estimate.tips[1:, X]), depth))
     return float(estimate.moves[min(k, len(estimate.moves) - 1)].motion.begun)
+
+
+def set_field(scenario: Scenario, estimate: Any, monitor: Monitor, since: float) -> Any:
+    """Return the estimate with the error of the tracker's field that the references show, from a time (s) on.
+
+    In a clean field it is the scenario's.
+    """
+    settings, largest, least = scenario.monitor, monitor.largest_indicator(), scenario.tracker.field_sd_mm
+    sd = settings.error_per_indicator_mm * largest / math.sqrt(3.0)
+    return estimate.with_field(max(least, sd) if largest > settings.indicator_limit else least, since)
 
 
 def check_uncertain(
