@@ -87,6 +87,7 @@ def _read_sensor(
     # Where most are outliers, they are no chance: the sensor is faulty, or the prediction is wrong.
     judged = good | outlying if outlying.sum() > _OUTLYING * (good | outlying).sum() else good
     nis = compared.nis(judged) if judged.any() else math.nan
+    monitor = monitor.innovate(nis)
     if monitor.excluded.ok:
         frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
         monitor = replace(monitor, excluded=frozen)
@@ -106,7 +107,10 @@ def exclude_faulty(
             return estimate.without(one.name, since), watch, tuple(states), OK
     active = [name for name in (TRACKER, *(one.name for one in states)) if watch.of(name).excluded.ok]
     conflicts = {name: estimate.conflict(name) for name in active}
-    faulty, verdict = judge_conflict(conflicts, {name: estimate.misfit(name) for name in active})
+    surprised = any(watch.of(name).surprised for name in active)
+    faulty, verdict = judge_conflict(
+        conflicts, {name: estimate.misfit(name) for name in active}, surprised=surprised
+    )
     if not faulty:
         return estimate, watch, tuple(states), verdict
     watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
@@ -116,21 +120,26 @@ def exclude_faulty(
     return estimate.without(faulty, since), watch, after, OK
 
 
-def judge_conflict(conflicts: Mapping[str, float], misfits: Mapping[str, float]) -> tuple[str, Verdict]:
+def judge_conflict(
+    conflicts: Mapping[str, float], misfits: Mapping[str, float], *, surprised: bool = False
+) -> tuple[str, Verdict]:
     """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
     Sensors that contradict each other cost the fit to all more than fits to each alone. What is left without the faulty
     one agrees with the model, and what is left without another does not. While this is not clear the insertion goes on,
     but not up to twice the limit of the cost. conflicts, misfits: of the sensors by name, as of an `Identified`.
+    surprised: True if readings are far from their predictions; a sensor may contradict itself, too.
     """
     most = max(conflicts.values(), default=0.0)
-    if most <= _CONFLICT:
+    if most <= _CONFLICT and not surprised:
         return "", OK
     first, *others = sorted(misfits, key=lambda name: misfits[name])
     ratio = min((misfits[name] for name in others), default=math.inf) / max(misfits[first], _LEAST_MISFIT)
     sure = most > _SURE * _CONFLICT
-    if ratio > (_CLEARER if sure else _CLEAR) or first == TRACKER:
+    if ratio > (_CLEARER if sure else _CLEAR) or (first == TRACKER and most > _CONFLICT):
         reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:g}"
+        if most <= _CONFLICT:
+            reason = f"without it the fit is {ratio:.1f} times better than without another"
         return first, Verdict(
             VerdictKind.CONTRADICTED, f"{TRACKER}: {reason}" if first == TRACKER else reason
         )
