@@ -84,10 +84,14 @@ def test_the_derivative_to_the_clock_is_that_of_readings_at_other_times():
 
     bins, off = residual(0.0)
     later, shifted = residual(step)
-    same = (bins.count == later.count).all(axis=1) & np.isin(bins.index, np.flatnonzero(estimate.timeline.turned))
+    same = (bins.count == later.count).all(axis=1) & np.isin(
+        bins.index, np.flatnonzero(estimate.timeline.turned)
+    )
     assert same.sum() >= 1
     depth = estimate.depths(bins)
-    jacobian = one.jacobian(bins, ends, depth, estimate.along_slopes(depth, 0), estimate.parameters, estimate.timeline)
+    jacobian = one.jacobian(
+        bins, ends, depth, estimate.along_slopes(depth, 0), estimate.parameters, estimate.timeline
+    )
     found, known = -(shifted - off)[same] / step, jacobian[same][:, :, one.slots.clock]
     np.testing.assert_allclose(found, known, atol=0.2 * np.abs(known).max())  # of noisy readings
 

@@ -71,7 +71,9 @@ def test_two_slices_find_a_constant_error_of_the_tracker():
     assert off(insertion) < 0.25
 
 
-@pytest.mark.parametrize(("fault", "size", "kind"), [("frozen", 1.0, "frozen"), ("drift", 0.4, "contradicted")])
+@pytest.mark.parametrize(
+    ("fault", "size", "kind"), [("frozen", 1.0, "frozen"), ("drift", 0.4, "contradicted")]
+)
 def test_a_faulty_fibre_is_excluded_and_the_needle_comes_to_its_target(fault, size, kind):
     sensor = {**FBG, "phantom": {"fault": {"kind": fault, "depth_mm": 12.0, "size": size}}}
     insertion = inserted(sensor)
@@ -93,7 +95,9 @@ def test_an_undeclared_error_of_the_tracker_that_grows_holds_the_needle():
 
 def test_in_a_distorted_field_a_fibre_leads_to_the_target():
     """The references show how large the tracker's error is; without a fibre the needle is held in air."""
-    changes = {"tracker__environment": "noisy"} | {key.replace(".", "__"): value for key, value in HOMED.items()}
+    changes = {"tracker__environment": "noisy"} | {
+        key.replace(".", "__"): value for key, value in HOMED.items()
+    }
     insertion = inserted(FBG, **changes)
     assert insertion.outcome == "done"
     assert off(insertion) < 0.4
@@ -103,7 +107,9 @@ def test_in_a_distorted_field_a_fibre_leads_to_the_target():
 def test_healthy_sensors_are_not_excluded():
     insertion = inserted(FBG, *SLICES)
     assert insertion.outcome == "done"
-    assert excluded(insertion, "fbg") is excluded(insertion, "slice 1") is excluded(insertion, "slice 2") is None
+    assert (
+        excluded(insertion, "fbg") is excluded(insertion, "slice 1") is excluded(insertion, "slice 2") is None
+    )
     states = [one for period in insertion.periods for one in period.sensors if one.name == "fbg"]
     assert 0.1 < np.nanmedian([one.nis for one in states]) < 2.0
 

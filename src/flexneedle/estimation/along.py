@@ -105,12 +105,13 @@ class Comparison:
             return np.nan
         mean = np.nansum(kept, axis=0)[seen] / count[seen]
         covariance = self.covariance[np.ix_(seen, seen)] + np.diag(self.noise**2 / count[seen])
-        return float(mean @ np.linalg.solve(covariance, mean)) / mean.size
+        square: float = mean @ np.linalg.solve(covariance, mean)
+        return square / int(mean.size)
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFit:
-    """A sensor in the fit, and its readings so far."""
+    """A sensor in the fit, and its readings until now."""
 
     sensor: Sensor
     slots: SensorSlots

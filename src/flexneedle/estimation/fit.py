@@ -275,7 +275,7 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
 
 
 def _renew(curves: Floats, which: Sequence[int], slopes: Floats, depth: Floats, grid: Floats) -> Floats:
-    """Return curves (K, g, d) with those of some parameters from slopes (k, m, d) at depths (m,), which do not fall."""
+    """Return curves (K, g, d), renewed for some parameters by slopes (k, m, d) at depths (m,), which do not fall."""
     right = np.clip(np.searchsorted(depth, grid, side="right"), 1, depth.size - 1)
     width = depth[right] - depth[right - 1]
     part = np.clip((grid - depth[right - 1]) / np.where(width > 0.0, width, 1.0), 0.0, 1.0)[:, None]

@@ -42,7 +42,7 @@ TRACKER = "tracker"
 
 
 class Part(NamedTuple):
-    """What a sensor adds to the cost of the fit, to its downhill gradient (K,), and to its second derivative (K, K)."""
+    """Share of a sensor in the cost of the fit, its downhill gradient (K,), and its second derivative (K, K)."""
 
     name: str
     cost: float

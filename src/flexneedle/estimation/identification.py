@@ -320,7 +320,7 @@ class Identified(FittedInsertion):
         return fitted.change(residual=low_pass(self.settings, fitted.without_field(left)) if inside else 0.0)
 
     def conflict(self, name: str) -> float:
-        """Return the cost of the fit beyond those of a sensor alone and of all others alone, to second order.
+        """Return the cost of a fit to all less the costs of fits to a sensor and to the others, to second order.
 
         About 0 or below for sensors that agree.
         """

@@ -14,7 +14,9 @@ SITES = {"kind": "fbg", "sites_mm": [11.0, 26.0, 70.0], **EXACT}
 def driven(phantom=None, moves=12, roll=0.0, **sensor):
     """Readings of a sensor while the needle advances and the guide moves, and the rig."""
     errors = {"site_mm": 0.0, "missing_fraction": 0.0, **(phantom or {})}
-    scenario = flexneedle.load_scenario("phantom3d").with_values({"sensor": [{**SITES, **sensor, "phantom": errors}]})
+    scenario = flexneedle.load_scenario("phantom3d").with_values(
+        {"sensor": [{**SITES, **sensor, "phantom": errors}]}
+    )
     rig = virtual_rig(scenario, 0.0, Seeds.of(3))
     found = []
     for k in range(moves):
@@ -90,7 +92,7 @@ def test_a_plant_without_nodes_has_no_sensors_along_it():
 
     scenario = flexneedle.load_scenario("phantom").with_values({"sensor": [SITES]})
     with pytest.raises(flexneedle.FlexneedleError, match="without nodes"):
-        virtual_rig(scenario, 0.0, Seeds.of(0), lambda truth, roll: Point())
+        virtual_rig(scenario, 0.0, Seeds.of(0), lambda truth, roll: Point())  # noqa: ARG005
 
 
 def test_the_trackers_error_grows_to_the_target_and_the_tracker_can_be_lost():

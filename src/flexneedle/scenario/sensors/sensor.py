@@ -1,6 +1,6 @@
 """A sensor along the needle: the common part of all kinds.
 
-A kind says what an error-free sensor measures on a needle, and how large the errors are. A reading is
+A kind defines the values of an error-free sensor on a needle, and the size of its errors. A reading is
 
     (1 + g) e^(i(ρ − φ)) (q + q' p) + o + w + ε
 

@@ -27,7 +27,7 @@ Row = Annotated[tuple[Entry, Entry, Entry, Entry], Field(strict=False)]
 class View(Range):
     """One `[[sensor]]` with `kind = "view"`.
 
-    Coordinates of a value are those across the insertion axis in the image; along it the image tells nothing.
+    A value is a coordinate across the insertion axis in the image; coordinates along it are not used.
     """
 
     kind: Literal["view"]
