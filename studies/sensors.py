@@ -1,8 +1,8 @@
 """Insertions with sensors along the needle, healthy and faulty, in random worlds in space on the exact plant.
 
-Each row is a set of sensors with an error or a fault. Sites, planes, gains and faults are drawn for each world. The table
-has the lateral distance from the target and the lateral error of the estimate, in mm, and the share of ends within the
-95 % region of the tip.
+Each row is a set of sensors with an error or a fault. Sites, planes, gains and faults are drawn for each world.
+The table has the lateral distance from the target and the lateral error of the estimate, in mm, and the share of ends
+within the 95 % region of the tip.
 
     python studies/sensors.py --worlds 100000 20 --out runs/sensors
 """

@@ -127,8 +127,10 @@ def judge_conflict(
 
     Sensors that contradict each other cost the fit to all more than fits to each alone. What is left without the faulty
     one agrees with the model, and what is left without another does not. While this is not clear the insertion
-    continues, but not up to twice the limit of the cost. conflicts, misfits: of the sensors by name, as of an `Identified`.
-    surprised: True if readings are far from their predictions; a sensor may contradict itself, too.
+    continues, but not up to twice the limit of the cost.
+
+    conflicts, misfits: of the sensors by name, as of an `Identified`; surprised: True if readings are far from their
+    predictions, since a sensor may contradict itself, too.
     """
     most = max(conflicts.values(), default=0.0)
     if most <= _CONFLICT and not surprised:

@@ -131,6 +131,10 @@ class Scenario(Section):
         values, changes = self.values(), {spell(key): value for key, value in changes.items()}
         for key, value in (changes | dict.fromkeys(find_replaced(changes))).items():
             set_value(values, key, _expand_environment(key, value))
+        for name in _LISTS:  # of keys such as sensor.0.kind, where there was none
+            tables = values.get(name)
+            if isinstance(tables, dict) and tables.keys() == {*range(len(tables))}:
+                values[name] = [tables[number] for number in range(len(tables))]
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:
