@@ -49,6 +49,7 @@ from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
+from flexneedle.scenario.sensors.sensor import predict_values, read_values
 from flexneedle.simulator.state import State
 from flexneedle.types import (
     DB_X,
@@ -76,6 +77,8 @@ _RECENT = 12  # moves whose residuals are low-passed
 @dataclass(frozen=True)
 class Identification:
     """The observer of `adaptive-mpc`, whose settings it uses."""
+
+    fuses = True
 
     def begin(self, task: Task) -> "Identified":
         """Return the estimate before the first reading, the prior's means. Raises ScenarioError for too short cells."""
@@ -298,7 +301,7 @@ class Identified(FittedInsertion):
         """Return the values (r, d) of readings."""
         length = self.nominal.scenario.needle.length_mm
         needle = Needles(self.state.nodes[None], length / (len(self.state.nodes) - 1))
-        return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
+        return np.array([read_values(one.sensor, each, needle, self.axes) for each in readings])
 
     def without(self, name: str, since: float) -> "Identified":
         """Return the estimate fitted again without the readings of a sensor, or the `TRACKER`, from a time (s) on."""
@@ -480,7 +483,7 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
             add([sd]).start if sd else None
             for sd in (math.radians(sensor.turn_sd_deg) * paired, sensor.delay_sd_s)
         )
-        values = sensor.predict(Needles(shapes, length / (shapes.shape[1] - 1)), axes)
+        values = predict_values(sensor, Needles(shapes, length / (shapes.shape[1] - 1)), axes)
         along.append(
             SensorFit(
                 sensor,

@@ -31,7 +31,7 @@ class PlaceErrors(SensorErrors):
 
 
 class Range(Sensor):
-    """A sensor that sees the needle from one x to another."""
+    """A sensor that measures the needle from one x to another."""
 
     from_mm: Coordinate = 0.0
     """x from which points are used."""
@@ -47,6 +47,8 @@ class Range(Sensor):
 
 class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
+
+    paired = True
 
     kind: Literal["points"]
     rate_hz: Positive = 2.0
