@@ -7,7 +7,7 @@ others than those of the scenario. The table has the lateral error of the estima
 """
 
 import argparse
-import csv
+import json
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -244,21 +244,20 @@ def main() -> None:
     ]
     chosen.out.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(chosen.workers) as pool:
+    with ProcessPoolExecutor(chosen.workers) as pool, (chosen.out / "rows.jsonl").open("w") as file:
         jobs = {pool.submit(run_case, *case): case for case in cases}
         for done, job in enumerate(as_completed(jobs), 1):
             try:
                 results.append(job.result())
+                file.write(json.dumps(results[-1]) + "\n")
+                file.flush()
             except FlexneedleError as error:
                 print(f"{jobs[job]}: {error}", file=sys.stderr)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
             print(f"\r{done} of {len(cases)}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    results.sort(key=lambda one: (one["world"], one["row"]))
-    if results:
-        with (chosen.out / "rows.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, results[0])
-            writer.writeheader()
-            writer.writerows(results)
     text = table(results)
     (chosen.out / "table.txt").write_text(text + "\n", encoding="utf-8")
     print(text)

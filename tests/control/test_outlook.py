@@ -18,12 +18,13 @@ GRID = np.arange(-30.0, 60.0)
 
 def linear(precision, curves, now=0.0, variance=1e-3):
     """Outlook and estimate of a linear problem: the tip is the sum of the parameters times their curves (K, g)."""
-    setup = SimpleNamespace(max_advance_mm=1.0)
+    setup = SimpleNamespace(tracked=True, max_advance_mm=1.0)
     estimate = SimpleNamespace(
+        tracked=True,
         precision=np.asarray(precision),
         reading_variance=variance,
-        nominal=SimpleNamespace(scenario=SimpleNamespace(setup=setup)),
-        state=SimpleNamespace(tip=np.array([now, 0.0, 0.0, 0.0, 0.0])),
+        nominal=SimpleNamespace(tracked=True, scenario=SimpleNamespace(setup=setup)),
+        state=SimpleNamespace(tracked=True, tip=np.array([now, 0.0, 0.0, 0.0, 0.0])),
         axes=1,
     )
     curves = np.asarray(curves)

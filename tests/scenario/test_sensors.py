@@ -1,157 +1,152 @@
-"""Rules of `[[sensor]]`: one line each, for places and names, and for kinds of a user."""
-
-import sys
-from types import ModuleType
+"""Kinds of sensors along the needle, against closed forms."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from flexneedle import Sensor, Y, load_scenario
-from flexneedle.errors import DriverError, ScenarioError
-from flexneedle.scenario.plausible import find_doubts
-from flexneedle.scenario.sensors.sensor import predict_values, read_values
+import flexneedle
+from flexneedle.scenario.sensors.fbg import Fbg, tilts_at
+from flexneedle.scenario.sensors.points import Points
+from flexneedle.scenario.sensors.sensor import turn
+from flexneedle.scenario.sensors.slice import Slice
+from flexneedle.scenario.sensors.view import View
 from flexneedle.types import Needles, Reading
 
-PHANTOM = load_scenario("phantom")
-SLICE = {"kind": "slice", "plane_mm": 30.0}
-POINTS = {"kind": "points", "to_mm": 40.0}
-REFUSED = {
-    "nothing measures": (
-        {"tracker.enabled": False},
-        "tracker.enabled = false: nothing measures the needle: ",
-    ),
-    "sites": (
-        {"sensor": [{"kind": "fbg", "sites_mm": [10.0, 149.0]}]},
-        "sensor[0].sites_mm = 149.0: the last gauge must end at most 150 from the tip",
-    ),
-    "plane too deep": (
-        {"sensor": [SLICE | {"plane_mm": 81.5}]},
-        "sensor[0].plane_mm = 81.5: is never crossed: ",
-    ),
-    "plane behind": (
-        {"sensor": [SLICE | {"plane_mm": -180.0}]},
-        "sensor[0].plane_mm = -180.0: is never crossed: ",
-    ),
-    "range": (
-        {"sensor": [POINTS | {"from_mm": 90.0, "to_mm": 99.0}]},
-        "sensor[0].from_mm = 90.0: no needle is there: the tip goes to 81.5",
-    ),
-    "range falls": (
-        {"sensor": [POINTS | {"to_mm": -1.0}]},
-        "sensor[0].to_mm = -1.0: must be above from_mm (0)",
-    ),
-    "twice": ({"sensor": [SLICE, SLICE]}, 'sensor[1].name = "slice": must differ from the name of sensor[0]'),
-    "tracker": (
-        {"sensor": [SLICE | {"name": "tracker"}]},
-        'sensor[0].name = "tracker": must differ from the name of the tracker',
-    ),
-    "rate": ({"sensor": [SLICE | {"rate_hz": 1e5}]}, "sensor[0].rate_hz = 100000.0: must be at most 50000"),
-    "kind": (
-        {"sensor": [{"kind": "ct"}]},
-        'sensor[0].kind = "ct": must be one of fbg, points, slice, view, or',
-    ),
-}
+LENGTH = 150.0
+PROJECTION = [[8.0, 1.0, 2.0, 300.0], [-1.0, 8.0, 3.0, 200.0], [0.001, 0.0, 0.002, 1.0]]
 
 
-@pytest.mark.parametrize(("changes", "line"), REFUSED.values(), ids=REFUSED)
-def test_sensors_that_cannot_measure_are_refused_in_one_line(changes, line):
-    with pytest.raises(ScenarioError) as caught:
-        PHANTOM.with_values(changes)
-    assert str(caught.value).startswith(line)
-    assert "\n" not in str(caught.value)
+def arc(radius, angle=0.0, nodes=61):
+    """A needle on an arc of a circle, whose base is along x, in a plane through x at an angle from y."""
+    s = np.linspace(0.0, LENGTH, nodes)
+    x, off = radius * np.sin(s / radius), radius * (1.0 - np.cos(s / radius))
+    slope = np.tan(s / radius)
+    cos, sin = np.cos(angle), np.sin(angle)
+    return Needles(np.stack([x, cos * off, sin * off, cos * slope, sin * slope], axis=1)[None], s[1])
+
+
+def wave(nodes):
+    """A needle along a sine."""
+    x = np.linspace(0.0, LENGTH, nodes)
+    slope, off = 0.02 * np.sin(x / 25.0), -0.5 * np.cos(x / 25.0)
+    return Needles(np.stack([x, off, 0 * x, slope, 0 * x], axis=1)[None], x[1])
+
+
+def straight(point, slopes, nodes=31):
+    """A straight needle from a point."""
+    slopes = np.array(slopes)
+    s = np.linspace(0.0, LENGTH, nodes)
+    x = s / np.sqrt(1.0 + slopes @ slopes)
+    rows = np.column_stack([point[0] + x, point[1] + slopes[0] * x, point[2] + slopes[1] * x])
+    return Needles(np.concatenate([rows, np.tile(slopes, (nodes, 1))], axis=1)[None], s[1])
+
+
+@given(st.floats(150.0, 3000.0), st.floats(0.0, 6.28), st.floats(6.0, 140.0))
+def test_the_curvature_of_an_arc_is_that_of_its_circle(radius, angle, site):
+    sensor = Fbg(kind="fbg", sites_mm=(site,), gauge_mm=5.0)
+    found = sensor.predict(arc(radius, angle), 2)[0]
+    np.testing.assert_allclose(found, [np.cos(angle) / radius, np.sin(angle) / radius], rtol=0.02, atol=1e-7)
+
+
+def test_slopes_between_nodes_converge_with_the_third_power_of_their_distance():
+    places = np.linspace(8.0, 140.0, 400)
+
+    def error(nodes):
+        return np.abs(
+            tilts_at(wave(nodes), places)[0, :, 0] - np.arctan(0.02 * np.sin((LENGTH - places) / 25.0))
+        ).max()
+
+    assert error(31) / error(61) == pytest.approx(8.0, rel=0.1)
+
+
+def test_the_derivatives_to_the_sites_are_those_of_moved_sites():
+    needle = wave(61)
+    sensor = Fbg(kind="fbg", sites_mm=(20.0, 70.0))
+    moved = Fbg(kind="fbg", sites_mm=(20.5, 70.0)).predict(needle, 2) - sensor.predict(needle, 2)
+    np.testing.assert_allclose(sensor.slopes(needle, 2)[:, :, 0] * 0.5, moved, rtol=0.03, atol=1e-9)
+    assert not sensor.slopes(needle, 2)[:, 2:, 0].any()
+
+
+@given(
+    st.floats(-0.15, 0.15),
+    st.floats(-0.15, 0.15),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.3, 0.3),
+    st.floats(20.0, 120.0),
+)
+def test_a_straight_needle_crosses_a_plane_of_any_pose_at_the_point_of_the_line(up, out, lean, turn_, at):
+    sensor = Slice(kind="slice", plane_mm=at, normal=(1.0, lean, turn_))
+    needle = straight((0.0, 1.0, -2.0), (up, out))
+    normal, line, start = np.array([1.0, lean, turn_]), np.array([1.0, up, out]), np.array([0.0, 1.0, -2.0])
+    crossing = start + line * (normal @ ([at, 0.0, 0.0] - start)) / (normal @ line)
+    values = sensor.predict(needle, 2)[0]
+    np.testing.assert_allclose(sensor.report(values, 2)[0], crossing, atol=1e-9)
+    np.testing.assert_allclose(sensor.read(Reading(0.0, (tuple(crossing),)), needle, 2), values, atol=1e-9)
+    assert sensor.sees(needle, 2).all() == (normal @ (needle.points[0, -1] - [at, 0.0, 0.0]) >= 0.0)
+
+
+def test_points_anywhere_along_the_needle_are_read_at_the_stations():
+    sensor = Points(kind="points", from_mm=10.0, to_mm=120.0)
+    needle = arc(300.0, 0.7)
+    x = np.random.default_rng(0).uniform(12.0, 100.0, 40)
+    off, cos, sin = 300.0 - np.sqrt(300.0**2 - x**2), np.cos(0.7), np.sin(0.7)
+    rows = np.column_stack([x, cos * off + 0.2, sin * off - 0.1])
+    found = (
+        sensor.read(Reading(0.0, tuple(map(tuple, rows.tolist()))), needle, 2) - sensor.predict(needle, 2)[0]
+    )
+    seen = np.isfinite(found)
+    np.testing.assert_allclose(
+        found[seen].reshape(-1, 2), np.tile([0.2, -0.1], (seen.sum() // 2, 1)), atol=2e-3
+    )
+    assert (
+        sensor.sees(needle, 2)[0].tolist()
+        == np.repeat(sensor.stations <= needle.points[0, -1, 0], 2).tolist()
+    )
+
+
+def test_a_view_measures_pixels_across_the_image_of_the_axis():
+    sensor = View(kind="view", to_mm=100.0, projection=PROJECTION)
+    needle = straight((-20.0, 0.0, 0.0), (0.05, -0.03))
+    matrix = np.array(PROJECTION)
+    image = np.column_stack([needle.points[0], np.ones(31)]) @ matrix.T
+    pixels = image[:, :2] / image[:, 2:]
+    found = sensor.read(Reading(0.0, tuple(map(tuple, pixels.tolist()))), needle, 2)
+    seen = np.isfinite(found)
+    np.testing.assert_allclose(found[seen], sensor.predict(needle, 2)[0][seen], atol=0.02)
+    assert not sensor.predict(straight((-20.0, 0.0, 0.0), (0.0, 0.0)), 2).round(9).any()
+    reported = sensor.report(sensor.predict(needle, 2)[0], 2)
+    np.testing.assert_allclose(
+        sensor.read(Reading(0.0, reported), needle, 2), sensor.predict(needle, 2)[0], atol=1e-9
+    )
+
+
+def test_pairs_turn_as_complex_numbers_and_in_the_plane_by_the_cosine():
+    values = np.array([[1.0, 2.0, -0.5, 0.3]])
+    turned = turn(values, np.exp(1j * np.array([0.4])), 2)
+    pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.exp(0.4j)
+    np.testing.assert_allclose(turned[:, ::2] + 1j * turned[:, 1::2], pairs)
+    np.testing.assert_allclose(turn(values, np.array([-1.0 + 0j]), 1), -values)
 
 
 @pytest.mark.parametrize(
-    ("changes", "key"),
+    ("sensor", "problem"),
     [
-        ({"sensor": [SLICE | {"plane_mm": 40.0}]}, "sensor[0].plane_mm"),
-        ({"sensor": [POINTS | {"from_mm": 40.0, "to_mm": 50.0}]}, "sensor[0].from_mm"),
-        ({"control.essential_points": True}, "control.essential_points"),
-        ({"tracker.enabled": False, "sensor": [SLICE]}, "control.start_axial_sd_mm"),
+        ({"kind": "sonar"}, "sensor[0].kind"),
+        ({"sites_mm": [10.0]}, "sensor[0].kind"),
+        ({"kind": "fbg", "sites_mm": [20.0, 10.0]}, "sensor[0].sites_mm"),
+        ({"kind": "points", "from_mm": 10.0, "to_mm": 5.0}, "sensor[0].to_mm"),
+        (
+            {"kind": "view", "to_mm": 50.0, "projection": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0]]},
+            "projection",
+        ),
+        ({"kind": "slice", "plane_mm": 30.0, "noise_per_m": 1.0}, "sensor[0].noise_per_m"),
     ],
 )
-def test_settings_without_effect_have_a_line(changes, key):
-    (line,) = find_doubts(PHANTOM.with_values(changes))
-    assert line.startswith(f"{key} = ")
+def test_a_wrong_sensor_is_refused_with_its_key(sensor, problem):
+    with pytest.raises(flexneedle.ScenarioError, match=problem.replace("[", r"\[").replace("]", r"\]")):
+        flexneedle.load_scenario("phantom").with_values({"sensor": [sensor]})
 
 
-class Offset(Sensor):
-    """The lateral position at the skin, mm."""
-
-    noise_mm: float = 0.1
-
-    @property
-    def noise(self):
-        return self.noise_mm
-
-    def predict(self, needles, axes):
-        del axes
-        return needles.at(0.0)[:, [Y]]
-
-
-def own(monkeypatch, **parts):
-    """Return the scenario with a sensor of a kind that differs in some parts."""
-    module = ModuleType("own_sensors")
-    module.Kind = type("Kind", (parts.pop("base", Offset),), parts)
-    monkeypatch.setitem(sys.modules, "own_sensors", module)
-    return PHANTOM.with_values({"sensor": [{"kind": "own_sensors:Kind"}]})
-
-
-def raising(*_):
-    raise ZeroDivisionError("no needle")
-
-
-WRONG = {
-    "no parts": ({"base": Sensor}, "must define noise, predict"),
-    "no sensor": ({"base": object}, "must be a subclass of flexneedle.Sensor"),
-    "shape": (
-        {"predict": lambda _, n, __: n.at(0.0)[:, Y]},
-        "predict must return an array of the shape (3, 1), ",
-    ),
-    "not finite": (
-        {"predict": lambda _, n, __: np.full((len(n.poses), 1), np.nan)},
-        "predict must return finite numbers for every needle",
-    ),
-    "raises": ({"predict": raising}, "raises ZeroDivisionError: no needle"),
-    "no noise": ({"noise": property(lambda _: 0.0)}, "noise must be above 0, not 0.0"),
-    "size": ({"size": lambda *_: 0}, "size must return a whole number above 0"),
-    "rolls alone": ({"rolls": True}, "a sensor that rolls must be paired"),
-    "model error": (
-        {"model_error": lambda *_: np.array([-1.0])},
-        "model_error must return 1 numbers that are at ",
-    ),
-}
-
-
-@pytest.mark.parametrize(("parts", "rule"), WRONG.values(), ids=WRONG)
-def test_a_wrong_kind_is_refused_in_one_line(monkeypatch, parts, rule):
-    with pytest.raises(ScenarioError) as caught:
-        own(monkeypatch, **parts)
-    assert str(caught.value).startswith(f'sensor[0].kind = "own_sensors:Kind": {rule}')
-    assert "\n" not in str(caught.value)
-
-
-def test_a_kind_of_two_definitions_has_its_name(monkeypatch):
-    (sensor,) = own(monkeypatch).sensor
-    assert (sensor.title, sensor.size(2), sensor.rate_hz) == ("Kind", 1, 20.0)
-
-
-def test_values_that_break_a_rule_during_an_insertion_name_the_sensor(monkeypatch):
-    (sensor,) = own(
-        monkeypatch, predict=lambda _, n, __: np.where(n.poses[:, :1, 0] < 0.0, 1.0, np.inf)
-    ).sensor
-    poses = np.zeros((1, 3, 5))
-    with pytest.raises(DriverError, match="sensor Kind: predict must return finite"):
-        predict_values(sensor, Needles(poses, 1.0), 1)
-    with pytest.raises(
-        DriverError, match="sensor Kind: a reading has 2 rows of 1 numbers, expected 1 numbers"
-    ):
-        read_values(sensor, Reading(0.0, ((1.0,), (2.0,))), Needles(poses, 1.0), 1)
-
-
-def test_poses_at_a_depth_are_on_the_needle_and_straight_beyond_it():
-    poses = np.zeros((2, 3, 5))
-    poses[..., 0] = [[-10.0, 0.0, 10.0], [-20.0, -10.0, 0.0]]
-    poses[..., 1] = 0.1 * poses[..., 0]
-    found = Needles(poses, 10.0).at(5.0)
-    np.testing.assert_allclose(found[:, :2], [[5.0, 0.5], [5.0, 0.5]])
+def test_a_scenario_without_sensors_does_not_list_them():
+    assert "sensor" not in flexneedle.load_scenario("phantom").values()

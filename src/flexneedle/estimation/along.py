@@ -123,7 +123,7 @@ class SensorFit:
     sensor: Sensor
     slots: SensorSlots
     axes: int
-    model_sd: Floats  # model error (d,) of the mean of a move
+    size: int  # number of values d
     depths: Floats  # of the tip at the knots of the drift (k,), mm, behind the skin
     time: Floats  # (r,), s
     value: Floats  # (r, d), NaN where nothing was measured
@@ -212,7 +212,7 @@ class SensorFit:
     def bin_at(self, time: Floats, line: Timeline) -> Bins:
         """Return bins (b,) of one reading each, at times (b,)."""
         index, part, angle = line.at(time)
-        none = np.zeros((len(time), len(self.model_sd)))
+        none = np.zeros((len(time), self.size))
         facing = np.exp(1j * angle) if self.sensor.rolls else np.ones(len(time), dtype=complex)
         return Bins(index, part, none, none, facing, time)
 
@@ -221,7 +221,7 @@ class SensorFit:
 
         It is 0 up to the skin, and changes by a step from knot to knot, linearly: a random walk.
         """
-        size = len(self.model_sd)
+        size = self.size
         width = self.axes if self.sensor.paired else 1
         begins = np.append(0.0, self.depths[:-1])
         ramps = np.clip((depth[:, None] - begins) / (self.depths - begins), 0.0, 1.0)
@@ -233,7 +233,7 @@ class SensorFit:
 
     def variances(self, bins: Bins) -> Floats:
         """Return the variances (b, d) of means, infinite where nothing was measured."""
-        noise = self.sensor.noise**2 / np.maximum(bins.count, 1.0) + self.model_sd**2
+        noise = self.sensor.noise**2 / np.maximum(bins.count, 1.0) + self.sensor.model_error(bins.value) ** 2
         return np.where(bins.count > 0.0, noise, np.inf)
 
     def expected(self, bins: Bins, ends: Floats, depth: Floats, parameters: Floats) -> Floats:
@@ -243,7 +243,7 @@ class SensorFit:
 
     def _errors(self, depth: Floats, parameters: Floats) -> Floats:
         """Return offset and drift (b, d), with the tip at depths (b,), mm."""
-        offset = np.broadcast_to(parameters[self.slots.offset], (len(depth), len(self.model_sd)))
+        offset = np.broadcast_to(parameters[self.slots.offset], (len(depth), self.size))
         if self.slots.drift.stop == self.slots.drift.start:
             return offset
         return offset + self._spread(depth) @ parameters[self.slots.drift]
@@ -255,7 +255,7 @@ class SensorFit:
     def _gains(self, parameters: Floats) -> Floats:
         """Return the gains (d,), or (1,) where their error is not estimated."""
         errors = parameters[self.slots.gain]
-        return 1.0 + (np.repeat(errors, len(self.model_sd) // errors.size) if errors.size else np.zeros(1))
+        return 1.0 + (np.repeat(errors, self.size // errors.size) if errors.size else np.zeros(1))
 
     def _with_gain(self, level: Floats, parameters: Floats) -> Floats:
         scaled = self._gains(parameters) * level

@@ -12,6 +12,7 @@ from flexneedle.loop.fusing import (
     check_uncertain,
     exclude_faulty,
     read_sensors,
+    set_field,
 )
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
@@ -140,12 +141,15 @@ def observe(
     monitor, readings = _check_readings(scenario, predicted, monitor, measurements, max_ages, now)
     newest = readings[-1]
     monitor, field = monitor.check_field()
-    if not field.ok:
+    fused = bool(sensors) and can_fuse(predicted) and scenario.monitor.error_per_indicator_mm > 0.0
+    if fused:
+        predicted = set_field(scenario, predicted, monitor, begun)
+    if not (field.ok or (fused and field.kind is VerdictKind.FIELD_DISTORTED)):
         rejected = _reject_readings(readings, field)
         return Observation(
             correct(()).without_reading(), monitor, rejected, newest.measurement, field, field=True
         )
-    if not (doubt := monitor.field_in_doubt()).ok:
+    if not (doubt := monitor.field_in_doubt()).ok and not fused:
         readings = _reject_readings(readings, doubt)
     good = [reading.measurement for reading in readings if reading.verdict.ok]
     corrected = correct(good)

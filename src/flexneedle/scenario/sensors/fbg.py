@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _PER_M = 1e-3
 _MODEL_PER_M = 0.01
 _STEP_MM = 1.0
-_MODEL_SHARE = 0.03  # of the curvature along the plan
+_MODEL_SHARE = 0.05  # of the curvature of a site
 
 
 class FbgErrors(SensorErrors):
@@ -110,10 +110,13 @@ class Fbg(Sensor):
         change = (further.predict(needles, axes) - self.predict(needles, axes)) / _STEP_MM
         return change[:, :, None] * np.repeat(np.eye(len(self.sites_mm)), axes, axis=0)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,), 1/mm: a constant, and a share of the curvature along the plan."""
-        found: Floats = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * np.sqrt(np.mean(planned**2, axis=0)))
-        return found
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), 1/mm: a constant, and a share of the curvature of the site."""
+        count = len(self.sites_mm)
+        sites = values.reshape(len(values), count, values.shape[1] // count)
+        size = np.sqrt((sites**2).sum(axis=2, keepdims=True))
+        found = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * size)
+        return np.broadcast_to(found, sites.shape).reshape(values.shape)
 
     def mounted(self, rng: np.random.Generator) -> Self:
         """Return the sensor with its sites displaced."""

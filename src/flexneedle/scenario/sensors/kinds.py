@@ -103,8 +103,8 @@ def _broken_rule(sensor: Sensor, axes: int, needles: Needles) -> str:
     if rule := values_rule(values, (len(needles.poses), size)):
         return f"predict {rule}"
     error = np.asarray(sensor.model_error(values), dtype=float)
-    if error.shape != (size,) or not (error >= 0.0).all():
-        return f"model_error must return {size} numbers that are at least 0, not {error.tolist()}"
+    if error.shape != values.shape or not (error >= 0.0).all():
+        return f"model_error must return an array of the shape of the values, {values.shape}, at least 0"
     return ""
 
 

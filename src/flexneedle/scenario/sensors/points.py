@@ -96,9 +96,9 @@ class Points(Range):
         """Return which stations are between base and tip (m, d)."""
         return passed(needles.points[..., X], self.stations, axes)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,), mm."""
-        return np.full(planned.shape[1], _MODEL_MM)
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), mm."""
+        return np.full(values.shape, _MODEL_MM)
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
         """Return the lateral positions at the stations of points x, y, z (mm)."""

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
-_MODEL_NOISE = 0.1  # model error of a kind without its own, over its noise,
-_MODEL_SHARE = 0.03  # and over the variation of its values along the plan
+_MODEL_NOISE = 0.3  # model error of a kind without its own, over its noise
 
 
 class Fault(Section):
@@ -115,13 +114,12 @@ class Sensor(Section):
         """Return which values (m, d) the sensor can measure on needles (default: all)."""
         return np.ones((len(needles.points), self.size(axes)), dtype=bool)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,) of the model's error in the mean of a move; planned (m, d): along the plan.
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d) of the model's error where these values (r, d) were measured.
 
-        Default: a tenth of the noise, and 3 % of the variation along the plan.
+        It is the error of the mean of a move, which no parameter explains. Default: 0.3 times the noise.
         """
-        found: Floats = np.hypot(_MODEL_NOISE * self.noise, _MODEL_SHARE * np.std(planned, axis=0))
-        return found
+        return np.full(values.shape, _MODEL_NOISE * self.noise)
 
     @property
     def offset_sd(self) -> float:

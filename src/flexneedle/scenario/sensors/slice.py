@@ -93,9 +93,9 @@ class Slice(Sensor):
         """Return whether needles have passed the plane (m, axes)."""
         return passed(self._in_frame(needles.points)[0], np.zeros(1), axes)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (axes,), mm."""
-        return np.full(planned.shape[1], _MODEL_MM)
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), mm."""
+        return np.full(values.shape, _MODEL_MM)
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
         """Return the coordinates in the plane of x, y, z (mm)."""

@@ -127,9 +127,9 @@ class View(Range):
         del axes
         return passed(self._in_image(self._pixels(needles.points))[0], self.stations, 1)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (s,), pixels."""
-        return np.full(planned.shape[1], _MODEL_MM * self._axis[2] / (self.to_mm - self.from_mm))
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), pixels."""
+        return np.full(values.shape, _MODEL_MM * self._axis[2] / (self.to_mm - self.from_mm))
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
         """Return the pixels across the axis at the stations of points in the image."""

@@ -97,7 +97,7 @@ class AirModel:
             sds += more
             size = sensor.size(axes)
             none = np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
-            sensors.append(SensorFit(sensor, sensor_slots, axes, np.zeros(size), np.zeros(0), *none))
+            sensors.append(SensorFit(sensor, sensor_slots, axes, size, np.zeros(0), *none))
         line = Timeline.of(run.moves, 0.0)
         tips = np.array([(one.time, one.x, one.y, one.z or 0.0) for one in run.measurements]).reshape(-1, 4)
         tips = tips[~rolling(line, tips[:, 0])]
@@ -228,7 +228,7 @@ class AirFit:
     def offset(self, number: int) -> list[tuple[float, float]]:
         """Return the offsets (d,) of a sensor, and their standard deviations, with the error of the model."""
         one = self.model.sensors[number]
-        unexplained = one.sensor.model_error(self.predicted[number])
+        unexplained = one.sensor.model_error(self.predicted[number]).mean(axis=0)
         places = range(one.slots.offset.start, one.slots.offset.stop)
         return [
             (value, math.hypot(sd, more))
