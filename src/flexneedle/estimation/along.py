@@ -5,6 +5,7 @@ before, each by the needle's angle at its time, so that the quantity of the mode
 offset turns instead.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.estimation.moves import Move
-from flexneedle.scenario.sensors.sensor import Sensor, turn
-from flexneedle.types import Flags, Floats, Needles
+from flexneedle.scenario.sensors.sensor import Sensor, predict_values, turn
+from flexneedle.types import Flags, Floats, Needles, Reading
 
 DOUBT = 2.0
 """Factor on the model's error where readings are compared with their predictions."""
@@ -109,6 +110,13 @@ class Comparison:
         return square / int(mean.size)
 
 
+def without_prediction(readings: Sequence[Reading]) -> Comparison:
+    """Return readings (r,) that are compared with nothing, of an estimate that does not predict them."""
+    known = [any(math.isfinite(value) for row in one.rows for value in row) for one in readings]
+    value = np.where(known, 0.0, np.nan)[:, None]
+    return Comparison(value, np.full_like(value, np.nan), np.eye(1), 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class SensorFit:
     """A sensor in the fit, and its readings until now."""
@@ -178,7 +186,7 @@ class SensorFit:
         """
         flat = poses.reshape(-1, *poses.shape[-2:])
         needles = Needles(flat, length / (flat.shape[1] - 1))
-        found = self.sensor.predict(needles, self.axes)[:, :, None]
+        found = predict_values(self.sensor, needles, self.axes)[:, :, None]
         if self.sensor.place_sds:
             found = np.concatenate([found, self.sensor.slopes(needles, self.axes)], axis=2)
         return found.reshape(*poses.shape[:-2], *found.shape[1:])

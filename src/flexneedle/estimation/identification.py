@@ -49,6 +49,7 @@ from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
+from flexneedle.scenario.sensors.sensor import read_values
 from flexneedle.types import (
     DB_X,
     PSI,
@@ -75,6 +76,8 @@ _RECENT = 12  # moves whose residuals are low-passed
 @dataclass(frozen=True)
 class Identification:
     """The observer of `adaptive-mpc`, whose settings it uses."""
+
+    fuses = True
 
     def begin(self, task: Task) -> "Identified":
         """Return the estimate before the first reading, the prior's means. Raises ScenarioError for too short cells."""
@@ -301,7 +304,7 @@ class Identified(FittedInsertion):
         """Return the values (r, d) of readings."""
         length = self.nominal.scenario.needle.length_mm
         needle = Needles(self.state.nodes[None], length / (len(self.state.nodes) - 1))
-        return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
+        return np.array([read_values(one.sensor, each, needle, self.axes) for each in readings])
 
     def without(self, name: str, since: float) -> "Identified":
         """Return the estimate fitted again without the readings of a sensor, or the `TRACKER`, from a time (s) on."""

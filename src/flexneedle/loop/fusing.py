@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.along import without_prediction
+from flexneedle.estimation.estimate import Estimate, can_fuse
 from flexneedle.estimation.fitted import TRACKER
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
@@ -79,7 +80,9 @@ def _read_sensor(
         return monitor, SensorState(sensor.title, verdict=monitor.excluded)
     depth = float(predicted.state.tip[X])
     monitor = monitor.add(readings, depth)
-    compared = predicted.compare(sensor.title, readings)
+    compared = (
+        predicted.compare(sensor.title, readings) if can_fuse(predicted) else without_prediction(readings)
+    )
     max_age = scenario.control.stale_after_s + now - begun + sensor.delay_s + 3.0 * sensor.delay_sd_s
     checked = check_readings(readings, compared, now, max_age)
     good = np.array([one.verdict.ok for one in checked])

@@ -18,6 +18,7 @@ from flexneedle.scenario.rules import (
     layer_problems,
     monitor_problems,
     plan_problems,
+    sensor_problems,
     target_problems,
     zone_problems,
 )
@@ -91,6 +92,7 @@ class Scenario(Section):
                 zone_problems(self.zone, self.zones, self.guard),
                 plan_problems(self.plan),
                 monitor_problems(self.monitor, self.tracker),
+                sensor_problems(self.sensor, self.tracker, self.needle, self.setup, self.target),
                 grid_problems(self.setup, self.contact, self.phantom, self.tracker),
             )
         )

@@ -31,6 +31,8 @@ class FbgErrors(SensorErrors):
 class Fbg(Sensor):
     """One `[[sensor]]` with `kind = "fbg"`."""
 
+    paired, rolls = True, True
+
     kind: Literal["fbg"]
     sites_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=1000)]
     """Distances of the sites from the tip, along the needle."""
@@ -92,11 +94,6 @@ class Fbg(Sensor):
     def place_sds(self) -> tuple[float, ...]:
         """Prior standard deviations of the distances of the sites from the tip, mm."""
         return (self.site_sd_mm,) * len(self.sites_mm) if self.site_sd_mm else ()
-
-    @property
-    def rolls(self) -> bool:
-        """True: it rolls with the needle."""
-        return True
 
     def predict(self, needles: Needles, axes: int) -> "Floats":
         """Return the mean curvatures (m, d), 1/mm, over the gauges."""

@@ -48,6 +48,8 @@ class Range(Sensor):
 class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
 
+    paired = True
+
     kind: Literal["points"]
     rate_hz: Positive = 2.0
     """Readings per second."""

@@ -33,6 +33,8 @@ class PlaneErrors(SensorErrors):
 class Slice(Sensor):
     """One `[[sensor]]` with `kind = "slice"`."""
 
+    paired = True
+
     kind: Literal["slice"]
     plane_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
     """x at which the plane meets the insertion axis."""
@@ -66,10 +68,6 @@ class Slice(Sensor):
     def wander_sd(self) -> float:
         """Standard deviation of the correlated noise, mm."""
         return self.wander_mm
-
-    def size(self, axes: int) -> int:
-        """Return the number of coordinates in the plane."""
-        return axes
 
     @property
     def frame(self) -> "Floats":

@@ -31,7 +31,9 @@ class View(Range):
     """
 
     kind: Literal["view"]
-    projection: Annotated[tuple[Row, Row, Row], Field(strict=False)]
+    projection: Annotated[
+        tuple[Row, Row, Row], Field(strict=False, json_schema_extra={"allowed": "3 lists of 4 numbers"})
+    ]
     """Matrix (3, 4): (column w, row w, w) in pixels = projection · (x, y, z, 1) in mm."""
     rate_hz: Positive = 10.0
     """Images per second."""
@@ -93,11 +95,6 @@ class View(Range):
     def stations(self) -> "Floats":
         """Pixels (s,) along the axis at which readings are compared."""
         return np.linspace(0.0, self._axis[2], _STATIONS)
-
-    @property
-    def paired(self) -> bool:
-        """False: a value is a number across the axis."""
-        return False
 
     @property
     def noise(self) -> float:

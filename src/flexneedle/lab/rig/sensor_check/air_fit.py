@@ -20,7 +20,7 @@ from flexneedle.estimation.prior import LEAST_SD, Priors
 from flexneedle.lab.rig.sensor_check.air_run import AirRun
 from flexneedle.mechanics.model import adapt_needle
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sensors.sensor import Sensor
+from flexneedle.scenario.sensors.sensor import Sensor, read_values
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL, Flags, Floats, Needles, X, Y, Z
 
@@ -125,7 +125,8 @@ class AirModel:
         spacing = self.length / (shapes.shape[1] - 1)
         needles = (Needles(shapes[k + 1][None], spacing) for k in index)
         values = [
-            one.sensor.read(each, needle, one.axes) for each, needle in zip(given, needles, strict=True)
+            read_values(one.sensor, each, needle, one.axes)
+            for each, needle in zip(given, needles, strict=True)
         ]
         value = np.array(values).reshape(-1, one.value.shape[1])
         if one.sensor.rolls and one.axes == 1:  # between half turns it leaves the plane
