@@ -142,7 +142,7 @@ def judge_conflict(
     ratio = min((misfits[name] for name in others), default=math.inf) / max(misfits[first], _LEAST_MISFIT)
     sure = most > _SURE * _CONFLICT
     if ratio > (_CLEARER if sure else _CLEAR) or (first == TRACKER and most > _CONFLICT):
-        reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:g}"
+        reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:.0f}"
         if most <= _CONFLICT:
             reason = f"without it the fit is {ratio:.1f} times better than without another"
         return first, Verdict(

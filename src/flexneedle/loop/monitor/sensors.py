@@ -81,5 +81,5 @@ def _check(one: Reading, sds: Floats, now: float, max_age: float) -> Verdict:
     if abs(now - one.time) > max_age:
         return Verdict(VerdictKind.STALE, f"{now - one.time:.3f} s old, limit {max_age:.3f} s")
     if (most := float(np.abs(sds).max())) > _OUTLIER_SDS:
-        return Verdict(VerdictKind.OUTLIER, f"{most:.1f} standard deviations, limit {_OUTLIER_SDS:g}")
+        return Verdict(VerdictKind.OUTLIER, f"{most:.1f} standard deviations, limit {_OUTLIER_SDS:.1f}")
     return OK
