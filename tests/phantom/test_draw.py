@@ -66,7 +66,7 @@ def entries(truth):
         "bevel": needle.bevel.offset_mm / PHANTOM.needle.bevel.offset_mm,
         "start": axial_error(truth),
         "modulus": needle.youngs_modulus_gpa / PHANTOM.needle.youngs_modulus_gpa,
-        **{name: getattr(truth, name) for name in (*PLANAR, *OUT)},
+        **{name: getattr(truth, name) for name in (*PLANAR, *OUT, "drift")},
     }
 
 
