@@ -10,6 +10,7 @@ import flexneedle
 from flexneedle.estimation.along import Comparison
 from flexneedle.loop.fusing import judge_conflict
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
+from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.types import Reading, VerdictKind
 
 FBG = {"kind": "fbg", "sites_mm": [11, 26, 70, 105]}
@@ -126,6 +127,13 @@ def test_the_same_seed_gives_the_same_insertion():
     one, again = inserted(FBG), inserted(FBG)
     assert [p.estimate for p in one.periods] == [p.estimate for p in again.periods]
     assert [p.sensors for p in one.periods[1:]] == [p.sensors for p in again.periods[1:]]
+
+
+def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
+    scenario, plan = planned()
+    rig = virtual_rig(scenario, plan.roll, Seeds.of(0))
+    with pytest.raises(flexneedle.RigError, match="lacks fbg"):
+        flexneedle.insert(scenario.with_values({"sensor": [FBG]}), plan, rig=rig)
 
 
 @pytest.mark.parametrize(
