@@ -264,12 +264,13 @@ class Identified(FittedInsertion):
 
     @property
     def tip_covariance(self) -> Floats:
-        """Covariance (3, 3) of the tip's x, y, z (mm²)."""
+        """Covariance (3, 3) of the tip's x, y, z (mm²), with the model's error at the tip."""
         slope = self._tip_slope
         parts = np.stack([slope.real, slope.imag])
         covariance = np.zeros((3, 3))
         covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
-        covariance[1:, 1:] = parts @ self.covariance @ parts.T
+        model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
+        covariance[1:, 1:] = parts @ self.covariance @ parts.T + model**2 * np.eye(2)
         return covariance
 
     @property
