@@ -270,7 +270,7 @@ class Identified(FittedInsertion):
         covariance = np.zeros((3, 3))
         covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
         model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
-        covariance[1:, 1:] = parts @ self.covariance @ parts.T + model**2 * np.eye(2)
+        covariance[1:, 1:] = parts @ self.covariance @ parts.T + model**2 * np.diag([1.0, self.axes - 1.0])
         return covariance
 
     @property
