@@ -24,7 +24,7 @@ class ShapeHistory:
             del self._kept[: -self._most]
 
     def at(self, time: float) -> tuple[Floats, float]:
-        """Return the poses (n, 5) and the roll (rad) at a time (s), those of the nearest shape outside of all."""
+        """Return the poses (n, 5) and the roll (rad) at a time (s): before the first and after the last, theirs."""
         k = bisect_right(self._kept, time, key=lambda one: one[0])
         if k in (0, len(self._kept)):
             _, roll, poses = self._kept[min(k, len(self._kept) - 1)]

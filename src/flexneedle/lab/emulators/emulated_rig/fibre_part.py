@@ -74,7 +74,7 @@ def section_of(fibre: Fbg, address: str) -> Mapping[str, Any]:
 def address_of_fibre(rig: RigFile, fibre: Fbg) -> tuple[str, int]:
     """Return host and port of the fibre in a rig file; any free port of this machine if the file has no such sensor.
 
-    Raises RigError if its gratings are not those of the emulated fibre.
+    Raises RigError if its gratings are not at the sites of the fibre.
     """
     part = next((one for one in rig.sensor if one.name == fibre.title), None)
     if part is None:
