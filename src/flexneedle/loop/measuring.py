@@ -47,6 +47,11 @@ class Observation:
         return tip or any(taken > time - 1e-6 for taken in self._sensor_times)
 
     @property
+    def sensed(self) -> bool:
+        """Whether a sensor along the needle, in use, has a good reading of this period."""
+        return any(state.good for state in self.sensors)
+
+    @property
     def newest(self) -> float:
         """Time (s) of the newest good reading of any sensor, the period's measurement's without others."""
         return max([self.measurement.time, *self._sensor_times])

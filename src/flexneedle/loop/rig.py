@@ -56,9 +56,10 @@ class Rig(RigSource):
         driver: Moves the needle.
         tracker: Measures its tip.
         truth: Returns the true state, which is only recorded; None on hardware.
-        expect: Called with the estimate and the command before each motion, so that readings during it can be checked;
-            None if they are not. The event `Decided` is no substitute: a late decision is carried out with a later
-            estimate, and a refused one not at all.
+        expect: Called before each motion, so that readings during it can be checked, with the estimate, the command,
+            and whether a sensor along the needle has measured it since the last motion; None if they are not. The event
+            `Decided` is no substitute: a late decision is carried out with a later estimate, and a refused one not at
+            all.
         deadline: Time (s) of a decision after which it is late: the tracker is read again before it is used. None: no
             decision is late.
         sensors: The scenario's sensors along the needle, by name.
@@ -71,7 +72,7 @@ class Rig(RigSource):
     driver: Driver
     tracker: TipTracker
     truth: Callable[[], Condition] | None = None
-    expect: Callable[[Estimate, Control], None] | None = None
+    expect: Callable[[Estimate, Control, bool], None] | None = None
     deadline: float | None = None
     sensors: Mapping[str, NeedleSensor] = field(default_factory=dict)
 

@@ -15,7 +15,7 @@ from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
-from flexneedle.phantom.tracking.along import VirtualSensor
+from flexneedle.phantom.tracking.along import MeasuredNeedle, VirtualSensor
 from flexneedle.phantom.tracking.field.field_tracker import FieldTracker
 from flexneedle.phantom.tracking.field.poses import SensorPose, placed_references, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
@@ -138,8 +138,8 @@ def virtual_rig(
     return Rig(phantom, phantom, described, phantom.condition, sensors=sensors)
 
 
-def virtual_sensors(scenario: Scenario, phantom: Phantom, seeds: Seeds) -> dict[str, VirtualSensor]:
-    """Return the scenario's sensors along the needle, on a phantom that keeps its shapes, by name."""
+def virtual_sensors(scenario: Scenario, phantom: MeasuredNeedle, seeds: Seeds) -> dict[str, VirtualSensor]:
+    """Return the scenario's sensors along the needle by name."""
     own = np.random.SeedSequence(entropy=seeds.tracker.entropy, spawn_key=(*seeds.tracker.spawn_key, 0))
     needle, axes, depth = scenario.needle, scenario.setup.axes, scenario.target.depth_mm
     return {

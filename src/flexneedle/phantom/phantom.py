@@ -2,7 +2,6 @@
 
 import cmath
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
+from flexneedle.phantom.shapes import ShapeHistory
 from flexneedle.phantom.spring_back import SpringBack
 from flexneedle.simulator.control import MOVES, Limits, limit_half_turn, roll_time
 from flexneedle.types import (
@@ -68,7 +68,7 @@ class Phantom:
         self._least_stretch = 1.0
         self._path = [(0.0, *self._tip().tolist())]  # time and pose
         self._keeps_shapes = keeps_shapes
-        self._shapes: list[tuple[float, float, Floats]] = []  # time, roll and poses
+        self._shapes = ShapeHistory()
         self._keep_shape(0.0)
 
     def condition(self) -> Condition:
@@ -134,13 +134,7 @@ class Phantom:
 
         It must have been made with `keeps_shapes`.
         """
-        k = bisect_right(self._shapes, time, key=lambda one: one[0])
-        if k in (0, len(self._shapes)):
-            _, roll, poses = self._shapes[min(k, len(self._shapes) - 1)]
-            return poses, roll
-        (t0, roll, poses), (t1, later, after) = self._shapes[k - 1 : k + 1]
-        part = (time - t0) / (t1 - t0) if t1 > t0 else 1.0
-        return poses + part * (after - poses), roll + part * (later - roll)
+        return self._shapes.at(time)
 
     def _roll(self, roll: float) -> float:
         """Roll with the base at rest; return the time (s) of the end. Between its ends the tip moves on an arc."""
@@ -173,9 +167,7 @@ class Phantom:
                 raise InputError(
                     f"phantom = {type(self._plant).__name__}: without nodes no [[sensor]] can measure it"
                 )
-            before = self._shapes[-1][1] if self._shapes else self._plant.roll
-            turned = math.remainder(self._plant.roll - before, 2.0 * math.pi)
-            self._shapes.append((time, before + turned, to_poses(nodes)))
+            self._shapes.add(time, self._plant.roll, to_poses(nodes))
 
     def _round_to_steps(self, command: Control) -> Floats:
         """Return the command in whole motor steps, within the limits; the rotation of the base is not rounded."""

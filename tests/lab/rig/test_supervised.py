@@ -143,12 +143,13 @@ def test_the_tip_is_expected_where_the_model_moves_it_from_its_estimate(command)
     simulator = Simulator(PHANTOM)
     state, _ = simulator.replay(simulator.start(), np.array([Control(db_x=1.0)] * 5))
     off = np.array([0.2, 0.3, 0.0, 0.01, 0.0])
-    driver.expect(SimpleNamespace(simulator=simulator, state=state, tip=state.tip + off, tip_sd=0.2), command)
+    estimate = SimpleNamespace(simulator=simulator, state=state, tip=state.tip + off, tip_sd=0.2)
+    driver.expect(estimate, command, True)
     driver.apply(command, 0.2)
     expected = axes.steps[0][3]
     assert expected.begin == pytest.approx((state.tip + off)[:3])
     assert expected.end == pytest.approx((simulator.step(state, command).tip + off)[:3])
-    assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
+    assert (expected.most_off, expected.sensed) == (pytest.approx(2.0 + 3 * 0.2), True)
 
 
 class Resting:

@@ -109,13 +109,14 @@ def _add_rig(commands: Commands) -> None:
     rig = add_command(
         commands,
         "rig",
-        "a whole rig: motors that move a virtual needle, and a tracker that measures its tip",
+        "a whole rig: motors that move a virtual needle, and a tracker and a fibre that measure it",
         _emulate_rig,
         "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
         "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
         about="Emulate the controller and tracker of a rig file, with the virtual phantom of a scenario "
-        "between them, in three processes, until Ctrl-C or SIGTERM. Prints one line when all are ready, and one "
-        "per event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
+        "between them, and an FBGS stream if the scenario has a sensor of kind fbg, each in a process, until Ctrl-C "
+        "or SIGTERM. Prints one line when all are ready, and one per event. "
+        "A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
     )
     rig.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
     rig.add_argument(
@@ -131,9 +132,15 @@ def _add_rig(commands: Commands) -> None:
     rig.add_argument(
         "--truth", type=expand_home, metavar="FILE", help="write the true states to a new CSV file"
     )
+    rig.add_argument(
+        "--save",
+        type=expand_home,
+        metavar="FILE",
+        help="write the rig file with the addresses of the devices, and with the fibre, to a new file",
+    )
     _add_fault(
         rig,
-        "a fault of aurora or galil at SECONDS after the start of tracking, or after the first motion",
+        "a fault of aurora, galil or fbgs at SECONDS after the start of tracking, the first motion or the first client",
         "docs/rig/emulate.md",
         device="DEVICE:",
     )
@@ -232,7 +239,8 @@ def _job(args: argparse.Namespace, faults: tuple[tuple[str, str], ...]) -> Emula
     from flexneedle.scenario.files import load_scenario
 
     record = None if args.plan is None else load(args.plan)
-    return make_job(load_rig(args.rig), load_scenario(args.scenario), record, args.seed, args.truth, faults)
+    rig, scenario = load_rig(args.rig), load_scenario(args.scenario)
+    return make_job(rig, scenario, record, args.seed, args.truth, faults, args.save)
 
 
 def _print_message(message: Mapping[str, Any]) -> None:

@@ -32,8 +32,9 @@ from flexneedle.types import Floats
 RATE_HZ = 100.0
 POSITIONS_MM = tuple(184.8 - 10.0 * n for n in range(18))
 """Distances from the tip of the gratings of values 3 to 20."""
+UNUSED = 2
+"""Number of values before the first grating."""
 
-_UNUSED = 2  # values before the first grating
 _SPECTRUM = 630  # values
 _CORES = 4
 _TICK_S = 0.01
@@ -52,8 +53,8 @@ FAULTS = {
 }
 """The kinds of fault; their times are since the first client."""
 
-Curvatures = Callable[[float], Floats]
-"""Returns κy, κz (2, n), 1/mm, at `POSITIONS_MM` at a time (s, monotonic)."""
+Curvatures = Callable[[float], Floats | None]
+"""Returns κy, κz (2, n), 1/mm, at the gratings at a time (s, monotonic), None if there are no new ones."""
 
 
 def turning_arc(time: float) -> Floats:
@@ -65,7 +66,7 @@ def turning_arc(time: float) -> Floats:
 
 def encode_frame(line: int, stamp: float, bends: Floats, *, error: int = 0, fibre: int = 0) -> bytes:
     """Return a frame. bends: κy, κz (2, n), 1/mm; stamp: time stamp, s."""
-    values = np.concatenate([np.zeros((2, _UNUSED)), bends], axis=1)
+    values = np.concatenate([np.zeros((2, UNUSED)), bends], axis=1)
     arrays = (np.hypot(*values), np.arctan2(values[1], values[0]))
     fields = (
         struct.pack("<H", error),
@@ -96,12 +97,13 @@ _SPECTRA = tuple(map(_spectrum, range(_CORES)))
 
 @dataclass
 class FbgsSession:
-    """Frames over time, with faults. Times are monotonic (s); frames count from `power_on`."""
+    """Frames over time, with faults. Times are monotonic (s); frames count from `power_on`, `rate_hz` a second."""
 
     faults: Sequence[Fault]
     power_on: float
     seed: int = 0
     curvatures: Curvatures = turning_arc
+    rate_hz: float = RATE_HZ
     line: int = 0
     _waiting: list[tuple[float, bytes]] = field(default_factory=list)
     _frame: tuple[int, float, Floats] | None = None
@@ -114,22 +116,24 @@ class FbgsSession:
     @property
     def due(self) -> float:
         """Time of the next frame."""
-        return self.power_on + (self.line + 1) / RATE_HZ
+        return self.power_on + (self.line + 1) / self.rate_hz
 
     def take_due(self, now: float) -> list[bytes]:
         """Return the bytes to send at a time. Frames that this process was too late for are left out."""
-        if now >= self.due:
-            self._waiting.append(self._next_frame(now))
+        if now >= self.due and (frame := self._next_frame(now)) is not None:
+            self._waiting.append(frame)
         due = [data for time, data in self._waiting if time <= now]
         self._waiting = [one for one in self._waiting if one[0] > now]
         return due
 
-    def _next_frame(self, now: float) -> tuple[float, bytes]:
-        """Return the time and the bytes of the newest frame."""
+    def _next_frame(self, now: float) -> tuple[float, bytes] | None:
+        """Return the time and the bytes of the newest frame, None without new curvatures."""
         faults = self.schedule.by_kind(now)
-        self.line = max(self.line + 1, int((now - self.power_on) * RATE_HZ))
+        self.line = max(self.line + 1, int((now - self.power_on) * self.rate_hz))
         if "stuck" not in faults:
-            self._bends = np.array(self.curvatures(now))
+            if (found := self.curvatures(now)) is None:
+                return None
+            self._bends = np.array(found)
         if "frozen" not in faults or self._frame is None:
             self._frame = self.line, now, self._bends
         line, stamp, bends = self._frame

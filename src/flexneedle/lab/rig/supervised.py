@@ -112,12 +112,12 @@ class SupervisedDriver:
         self._moved, self._rolled = np.zeros(MOVES), roll
         self._expected: Expectation | None = None
 
-    def expect(self, estimate: Estimate, command: Control) -> None:
-        """Set the expected tip before and after a command, for the check of readings."""
+    def expect(self, estimate: Estimate, command: Control, sensed: bool) -> None:
+        """Set the expected tip before and after a command, for the check of readings; sensed: as in `Expectation`."""
         moved = carry_out(estimate.simulator, estimate.state, command).tip - estimate.state.tip
         x, y, z = (estimate.tip + moved)[: Z + 1].tolist()
         limit = innovation_limit(self._scenario, estimate.tip_sd)
-        self._expected = Expectation(Pose.of(estimate.tip).point, (x, y, z), limit)
+        self._expected = Expectation(Pose.of(estimate.tip).point, (x, y, z), limit, sensed)
 
     def apply(self, command: Control, duration: float) -> Motion:
         """Roll at the scenario's speed of rotation, confirm that by its position, then travel in `duration` s.

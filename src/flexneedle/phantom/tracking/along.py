@@ -1,12 +1,28 @@
 """Virtual sensors along the needle, on the true needle, with errors that the observer does not know."""
 
 import math
+from typing import Protocol
 
 import numpy as np
 
-from flexneedle.phantom.phantom import Phantom
 from flexneedle.scenario.sensors.sensor import Fault, Sensor, predict_values, turn
-from flexneedle.types import VISIBLE, Floats, Matrix, Needles, Reading, X
+from flexneedle.types import VISIBLE, Floats, Matrix, Needles, Point, Reading, X
+
+
+class MeasuredNeedle(Protocol):
+    """The true needle as sensors measure it: a `Phantom` that keeps its shapes, or a needle with such a history."""
+
+    def now(self) -> float:
+        """Return the time (s) since the start."""
+        ...
+
+    def tip_at(self, time: float, /) -> Point:
+        """Return the true tip x, y, z (mm) at a time (s)."""
+        ...
+
+    def shape_at(self, time: float, /) -> tuple[Floats, float]:
+        """Return the true poses (n, 5), at equal distances along the needle, and its roll (rad) at a time (s)."""
+        ...
 
 
 class VirtualSensor:
@@ -14,7 +30,7 @@ class VirtualSensor:
 
     Args:
         sensor: The sensor as the scenario describes it.
-        phantom: The phantom, which must keep its shapes.
+        phantom: The phantom.
         axes: Lateral axes.
         depth: Depth (mm) of the target, at which a drift is complete.
         length: Length of the needle (mm).
@@ -24,7 +40,7 @@ class VirtualSensor:
     def __init__(
         self,
         sensor: Sensor,
-        phantom: Phantom,
+        phantom: MeasuredNeedle,
         axes: int,
         depth: float,
         length: float,
@@ -51,6 +67,11 @@ class VirtualSensor:
         self._taken = -1
         self._last: Matrix | None = None
         self._lost = False
+
+    @property
+    def clock_error(self) -> float:
+        """Error of the time stamps (s)."""
+        return self._clock
 
     @property
     def status(self) -> str:

@@ -57,3 +57,20 @@ def test_the_expected_motion_of_the_tip_waits_with_its_motors():
         watch.with_later_end(NOW + 0.5, 1.0), expected=Expectation((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), 0.1)
     )
     assert halfway.with_readings([measured(4, NOW + 1.0, 4.5)], NOW + 1.0, VISIBLE).verdict.ok
+
+
+@pytest.mark.parametrize(
+    ("reading", "kind"),
+    [
+        ((), VerdictKind.OK),
+        ((measured(2, x=5.0),), VerdictKind.INNOVATION),
+        ((measured(2, x=math.nan),), VerdictKind.NOT_A_NUMBER),
+    ],
+)
+def test_a_step_with_a_sensor_along_the_needle_needs_no_tracker_but_none_that_contradicts(reading, kind):
+    """The next step needs a new reading of a sensor."""
+    sensed = replace(AT_TIP, sensed=True)
+    watch = TipWatch(Monitor(MonitorSettings(references=0)), 0.25, NOW - 1.0)
+    moving = watch.with_expectation(sensed, NOW, NOW + 1.0).with_readings(reading, NOW, VISIBLE)
+    assert moving.permission.kind is kind
+    assert not moving.with_expectation(AT_TIP, NOW, NOW + 1.0).permission.ok

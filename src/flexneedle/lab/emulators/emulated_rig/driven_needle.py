@@ -49,6 +49,11 @@ class DrivenNeedle:
         return parts
 
     @property
+    def shape(self) -> tuple[float, ...]:
+        """Roll (rad) and the nodes x, y, z (mm) from base to tip, one after the other."""
+        return self._plant.roll, *self._plant.nodes.ravel().tolist()
+
+    @property
     def strain_energy(self) -> float:
         """Strain energy of the tissue, weighted by layer (mJ)."""
         return self._plant.strain_energy

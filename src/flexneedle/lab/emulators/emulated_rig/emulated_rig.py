@@ -1,15 +1,20 @@
-"""Parent of the three processes of an emulated rig: it starts them, forwards orders to them, and ends them."""
+"""Parent of the processes of an emulated rig: it starts them, forwards orders to them, and ends them."""
 
 import select
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from time import monotonic
 from typing import Any, NoReturn, Self
 
+import tomli_w
+
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.emulators import aurora_faults
+from flexneedle.lab.emulators import aurora_faults, fbgs
 from flexneedle.lab.emulators.aurora_server import SerialPort
+from flexneedle.lab.emulators.emulated_rig.fibre_part import address_of_fibre, section_of
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.motors_part import address_of
 from flexneedle.lab.emulators.emulated_rig.tracker_part import port_of
@@ -17,13 +22,16 @@ from flexneedle.lab.emulators.faults import FaultKind, parse_fault, parse_order
 from flexneedle.lab.emulators.galil import galil_server as galil
 from flexneedle.lab.emulators.orders import Orders
 from flexneedle.lab.process import ChildProcess
-from flexneedle.lab.rig.rig_file import RigFile
 
-DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora_faults.FAULTS, "galil": galil.FAULTS}
+DEVICES: Mapping[str, Mapping[str, FaultKind]] = {
+    "aurora": aurora_faults.FAULTS,
+    "galil": galil.FAULTS,
+    "fbgs": fbgs.FAULTS,
+}
 """Kinds of fault by device."""
 
-_PHANTOM, _GALIL, _AURORA = "phantom", "galil", "aurora"
-_MODULES = {_PHANTOM: "phantom", _GALIL: "motors_part", _AURORA: "tracker_part"}
+_PHANTOM, _GALIL, _AURORA, _FBGS = "phantom", "galil", "aurora", "fbgs"
+_MODULES = {_PHANTOM: "phantom", _GALIL: "motors_part", _AURORA: "tracker_part", _FBGS: "fibre_part"}
 _END_S = 3.0  # for a process to end by itself
 _FOLLOW_S = 0.5  # a process that has lost another may end before it
 
@@ -40,17 +48,33 @@ def split_fault(given: str) -> tuple[str, str]:
     return device, text
 
 
-def check_free(rig: RigFile) -> None:
-    """Check that the controller's address and the tracker's path are free, before the phantom is made.
+def check_free(job: EmulationJob) -> None:
+    """Check that the addresses, the tracker's path and the name of the rig file are free, before the phantom is made.
 
     Making the phantom takes long. Raises InputError if one of them cannot be used, RigError if one is invalid.
     """
-    with galil.TcpServer(*address_of(rig)), SerialPort(Path(port_of(rig))):
-        pass
+    rig, fibre = job.rig, job.fibre
+    with ExitStack() as stack:
+        stack.enter_context(galil.TcpServer(*address_of(rig)))
+        if fibre is not None:
+            stack.enter_context(fbgs.FbgsServer(*address_of_fibre(rig, fibre)))
+        stack.enter_context(SerialPort(Path(port_of(rig))))
+    if job.save is not None and job.save.exists():
+        raise InputError(f"{job.save}: already exists: choose another file, or remove it")
+
+
+def rig_values(job: EmulationJob, addresses: Mapping[str, str]) -> dict[str, Any]:
+    """Return the values of the rig file with the addresses of the devices, and the fibre."""
+    values = job.rig.model_dump(mode="json", exclude_unset=True)
+    values["driver"]["address"], values["tracker"]["port"] = addresses[_GALIL], addresses[_AURORA]
+    if job.fibre is not None:
+        values["sensor"] = [one for one in values.get("sensor", ()) if one["name"] != job.fibre.title]
+        values["sensor"].append(section_of(job.fibre, addresses[_FBGS]))
+    return values
 
 
 class EmulatedRig:
-    """Processes of an emulated rig. Use it as a context manager; within, all three serve.
+    """Processes of an emulated rig. Use it as a context manager; within, all serve.
 
     say: called with each message, values by name. Raises InputError or RunError if a process cannot begin.
     """
@@ -60,20 +84,27 @@ class EmulatedRig:
         self._parts: dict[str, ChildProcess] = {}
 
     def __enter__(self) -> Self:
-        check_free(self._job.rig)
+        check_free(self._job)
         from_motors, to_phantom = socket.socketpair()
         from_phantom, to_tracker = socket.socketpair()
         ends = {_PHANTOM: (from_motors, to_tracker), _GALIL: (to_phantom,), _AURORA: (from_phantom,)}
+        if self._job.fibre is not None:
+            from_needle, to_fibre = socket.socketpair()
+            # Before the motors, whose records make the phantom send shapes.
+            ends = {_PHANTOM: (*ends.pop(_PHANTOM), to_fibre), _FBGS: (from_needle,), **ends}
         try:
             addresses = {name: self._start(name, mine) for name, mine in ends.items()}
         except BaseException:
             self._end()
             raise
         finally:
-            for end in (from_motors, to_phantom, from_phantom, to_tracker):
+            for end in chain.from_iterable(ends.values()):
                 end.close()
         pids = {name: part.pid for name, part in self._parts.items()}
-        ready = {name: addresses[name] for name in (_GALIL, _AURORA)}
+        ready = {name: addresses[name] for name in DEVICES if name in addresses}
+        if self._job.save is not None:
+            with self._job.save.open("x", encoding="utf-8") as file:
+                file.write(tomli_w.dumps(rig_values(self._job, ready)))
         self._say({"ready": ready, "pids": pids, "time_s": monotonic()})
         return self
 
@@ -103,13 +134,14 @@ class EmulatedRig:
                     return message["ready"]
 
     def _forward_order(self, line: str) -> None:
-        """Forward `fault DEVICE:KIND…` to its device, `clear` to both."""
+        """Forward `fault DEVICE:KIND…` to its device, `clear` to all."""
+        devices = [name for name in DEVICES if name in self._parts]
         if line.strip() == "clear":
-            for name in DEVICES:
+            for name in devices:
                 self._parts[name].channel.send("clear")
             return
         try:
-            device, order = _split_order(line)
+            device, order = _split_order(line, devices)
         except InputError as error:
             self._say({"refused": line.strip(), "reason": str(error)})
             return
@@ -158,13 +190,13 @@ def _raise_failures(part: ChildProcess) -> Iterator[Mapping[str, Any]]:
         yield message
 
 
-def _split_order(line: str) -> tuple[str, str]:
+def _split_order(line: str, devices: Sequence[str]) -> tuple[str, str]:
     """Return device and order of `fault DEVICE:KIND…`. Raises InputError, also for a fault that the device lacks."""
     word, _, given = line.strip().partition(" ")
     device, _, text = given.strip().partition(":")
-    if word != "fault" or device not in DEVICES:
+    if word != "fault" or device not in devices:
         raise InputError(
-            f"{line.strip()}: must be fault DEVICE:KIND[=DETAIL][:DURATION], with DEVICE {' or '.join(DEVICES)}, "
+            f"{line.strip()}: must be fault DEVICE:KIND[=DETAIL][:DURATION], with DEVICE {' or '.join(devices)}, "
             "or clear"
         )
     order = f"fault {text}"

@@ -1,17 +1,21 @@
-"""Tip that follows the records of the true needle: the source of an emulated tracker's frames."""
+"""Tip and needle that follow the records of the true needle: sources of an emulated tracker and fibre."""
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from math import floor
+from time import monotonic
 
 import numpy as np
 
 from flexneedle.geometry.quaternion import along
 from flexneedle.lab.emulators.emulated_rig.stream import Record
 from flexneedle.lab.emulators.motion import RATE_HZ
-from flexneedle.types import Point, Quaternion
+from flexneedle.phantom.phantom import to_poses
+from flexneedle.phantom.shapes import ShapeHistory
+from flexneedle.types import Floats, Point, Quaternion
 
 _LONGEST = 4000  # records: 16 s of motion
+_MOST_SHAPES = 1000
 
 
 class TipHistory:
@@ -54,3 +58,37 @@ class TipHistory:
         x, y, z = values[:3].tolist()
         w, i, j, k = along(values[3:] / np.linalg.norm(values[3:])).tolist()
         return (x, y, z), (w, i, j, k)
+
+
+class NeedleHistory:
+    """The true needle for a `VirtualSensor`, in s after `power_on`. A record has the values of `DrivenNeedle.shape`.
+
+    After the newest record the needle counts as at rest: with a `delay_s` of a few milliseconds or more all is known.
+    Shapes of the last 4 s of motion are kept.
+
+    Attributes:
+        late: Time (s) by which its clock is slow, so that readings arrive later.
+    """
+
+    def __init__(self, power_on: float, first: Record, clock: Callable[[], float] = monotonic) -> None:
+        self._power_on, self._clock, self._shapes = power_on, clock, ShapeHistory(_MOST_SHAPES)
+        self.late = 0.0
+        self.add([first])
+
+    def add(self, records: Iterable[Record]) -> None:
+        """Add records, oldest first."""
+        for time, (roll, *nodes), _ in records:
+            self._shapes.add(time - self._power_on, roll, to_poses(np.reshape(nodes, (-1, 3))))
+
+    def now(self) -> float:
+        """Return the time (s)."""
+        return self._clock() - self._power_on - self.late
+
+    def tip_at(self, time: float) -> Point:
+        """Return the end of the needle's axis x, y, z (mm) at a time."""
+        x, y, z = self.shape_at(time)[0][-1, :3].tolist()
+        return x, y, z
+
+    def shape_at(self, time: float) -> tuple[Floats, float]:
+        """Return the poses (n, 5) along the needle, and its roll (rad) at a time."""
+        return self._shapes.at(time)

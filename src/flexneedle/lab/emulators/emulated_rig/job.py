@@ -9,13 +9,15 @@ from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.planning.origin import check_origin, with_planned_entry
 from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sensors.fbg import Fbg
 
 
 @dataclass(frozen=True)
 class EmulationJob:
     """A rig, the scenario of its phantom, the seed of the draw, and the file of the true states or None.
 
-    faults: texts of scheduled faults by device, "aurora" or "galil".
+    faults: texts of scheduled faults by device, "aurora", "galil" or "fbgs"; save: new file for the rig file with the
+    addresses, or None.
     """
 
     rig: RigFile
@@ -23,6 +25,12 @@ class EmulationJob:
     seed: int = 0
     truth: Path | None = None
     faults: tuple[tuple[str, str], ...] = ()
+    save: Path | None = None
+
+    @property
+    def fibre(self) -> Fbg | None:
+        """The fibre with gratings in the needle, None without one."""
+        return next((one for one in self.scenario.sensor if isinstance(one, Fbg)), None)
 
     def faults_of(self, device: str) -> list[str]:
         """Return the texts of the scheduled faults of a device."""
@@ -36,11 +44,13 @@ def make_job(
     seed: int,
     truth: Path | None,
     faults: tuple[tuple[str, str], ...],
+    save: Path | None = None,
 ) -> EmulationJob:
     """Return the job of a rig, a scenario, and the record of a plan, of an insertion or None.
 
     Raises InputError if it cannot be emulated: devices of another kind, a tracker in an environment, an entry that is
-    free without a plan, several plans, or one of another scenario; RigError for axes that the phantom cannot have.
+    free without a plan, several plans, one of another scenario, or several fibres; RigError for axes that the phantom
+    cannot have.
     """
     for part, kind in (("driver", "galil"), ("tracker", "aurora")):
         if (given := getattr(rig, part).kind) != kind:
@@ -60,4 +70,9 @@ def make_job(
             "entry: the plan chooses it (free_radius_mm, free_slope_mrad); give the plan with --plan"
         )
     carriages_of(rig.axes, scenario)
-    return EmulationJob(rig, scenario, seed, truth, faults)
+    job = EmulationJob(rig, scenario, seed, truth, faults, save)
+    if sum(isinstance(one, Fbg) for one in scenario.sensor) > 1:
+        raise InputError("sensor: an emulated rig has one sensor of kind fbg; leave the others out")
+    if job.fibre is None and job.faults_of("fbgs"):
+        raise InputError("--fault fbgs: the scenario has no sensor of kind fbg")
+    return job

@@ -1,6 +1,6 @@
 """Phantom of an emulated rig: a process in which the true needle follows the motors.
 
-`python -m flexneedle.lab.emulators.emulated_rig.phantom PARENT MOTORS TRACKER`, with descriptors of channels.
+`python -m flexneedle.lab.emulators.emulated_rig.phantom PARENT MOTORS TRACKER [FIBRE]`, with descriptors of channels.
 """
 
 import gc
@@ -51,7 +51,8 @@ def make_sensor(job: EmulationJob, truth: Truth) -> PhantomSensor:
 class EmulatedPhantom:
     """The true needle, moved by the records of the motors.
 
-    tracker: channel for the poses of the tip; truth: writer of the true states, or None; note: reports a line.
+    tracker: channel for the poses of the tip; truth: writer of the true states, or None; note: reports a line; fibre:
+    channel for the shapes of the needle, or None.
     """
 
     def __init__(
@@ -60,14 +61,15 @@ class EmulatedPhantom:
         tracker: MessageChannel,
         truth: TruthWriter | None,
         note: Callable[[str], None],
+        fibre: MessageChannel | None = None,
     ) -> None:
         self._carriages, self._channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
         self._positions = start_positions(self._carriages)
         drawn_truth = draw_phantom(job)
         self._needle = DrivenNeedle(drawn_truth, self._positions)
         self._sensor, self._truth = make_sensor(job, drawn_truth), truth
-        self._tracker, self._note = tracker, note
-        self._seen = self._sensor.at(self._needle.tip)
+        self._tracker, self._note, self._fibre = tracker, note, fibre
+        self._seen, self._shape = self._sensor.at(self._needle.tip), self._needle.shape
         self._lags: deque[float] = deque(maxlen=_KEPT)
         self._steps, self._warned, self._failed = 0, -_WARN_S, False
 
@@ -76,12 +78,14 @@ class EmulatedPhantom:
         self.follow(Record(monotonic(), (0.0,) * len(CHANNELS), False))
 
     def follow(self, record: Record) -> None:
-        """Follow the motors, and send the pose of the tip."""
+        """Follow the motors, and send the pose of the tip, and the shape of the needle."""
         self._positions = positions_after(self._carriages, self._channels, self._positions, record.values)
         if parts := self._needle.follow(self._positions, exactly=not record.moving):
             self._steps += parts
-            self._seen = self._sensor.at(self._needle.tip)
+            self._seen, self._shape = self._sensor.at(self._needle.tip), self._needle.shape
         send_record(self._tracker, record._replace(values=tuple(self._seen)), "tracker")
+        if self._fibre is not None:
+            send_record(self._fibre, record._replace(values=self._shape), "fibre")
         lag = monotonic() - record.time
         if self._truth is not None:
             self._truth.write(self._row(record, lag))
@@ -121,12 +125,12 @@ class EmulatedPhantom:
 
 def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:
     """Follow the motors until they or the parent end."""
-    motors, tracker = channels
+    motors, tracker, *fibre = channels
     with ExitStack() as stack:
         axes = [name for name, _ in job.rig.axes.items()]
         truth = None if job.truth is None else stack.enter_context(TruthWriter(job.truth, axes))
         compile_kernels(job.scenario.setup.axes)  # not while the motors turn
-        world = EmulatedPhantom(job, tracker, truth, parent.note)
+        world = EmulatedPhantom(job, tracker, truth, parent.note, *fibre)
         world.begin()
         gc.collect()
         gc.freeze()

@@ -4,6 +4,7 @@ A record has a time (s, monotonic clock), numbers, and whether the described par
 the time of the newest record.
 """
 
+import select
 from typing import NamedTuple
 
 from flexneedle.errors import RunError
@@ -48,3 +49,10 @@ def receive_records(channel: MessageChannel) -> list[Record]:
     if channel.ended and not records:
         raise ChannelEnded
     return records
+
+
+def receive_first(channel: MessageChannel) -> Record:
+    """Wait for the first records, and return the newest. Raises ChannelEnded."""
+    while not (records := receive_records(channel)):
+        select.select([channel], [], [])
+    return records[-1]

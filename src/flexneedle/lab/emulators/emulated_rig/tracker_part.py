@@ -3,7 +3,6 @@
 `python -m flexneedle.lab.emulators.emulated_rig.tracker_part PARENT PHANTOM`, with descriptors of channels.
 """
 
-import select
 import signal
 from pathlib import Path
 from time import monotonic
@@ -15,7 +14,7 @@ from flexneedle.lab.emulators.aurora_server import EmulatorSession, SerialPort, 
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
 from flexneedle.lab.emulators.emulated_rig.following import TipHistory
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
-from flexneedle.lab.emulators.emulated_rig.stream import Record, receive_records
+from flexneedle.lab.emulators.emulated_rig.stream import receive_first, receive_records
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.motion import SensorNoise
 from flexneedle.lab.process import MessageChannel
@@ -28,7 +27,7 @@ def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> N
     """Serve the tracker at its port until the parent ends."""
     (phantom,) = channels
     faults = [parse_fault(text, FAULTS) for text in job.faults_of("aurora")]
-    followed = TipHistory(begun := monotonic(), _receive_first(phantom))
+    followed = TipHistory(begun := monotonic(), receive_first(phantom))
     parent.others, parent.take = channels, lambda: followed.add(receive_records(phantom))
     session = EmulatorSession(power_on(), faults, job.seed, begun, tip=followed, noise=noise_of(job.scenario))
     session.on_tracking = lambda now: parent.report(event="tracking", time_s=now)
@@ -37,13 +36,6 @@ def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> N
         set_realtime_priority()
         parent.report(ready=str(serial.link))
         serve(session, serial, parent, lambda order: parent.obey(session.schedule, order), parent.note)
-
-
-def _receive_first(phantom: MessageChannel) -> Record:
-    """Wait for the first records, and return the newest."""
-    while not (records := receive_records(phantom)):
-        select.select([phantom], [], [])
-    return records[-1]
 
 
 def port_of(rig: RigFile) -> str:

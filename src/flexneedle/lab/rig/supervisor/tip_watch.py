@@ -12,6 +12,7 @@ from flexneedle.ports import Tracker
 from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKind
 
 _NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # never good, whatever is expected
+_LOST = (VerdictKind.MISSING, VerdictKind.STALE)  # nothing against what is expected
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,12 @@ class TipWatch:
         axes = min(len(place), 1 + self.monitor.axes)
         again = rules.check_innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
         return replace(watch, verdict=again)
+
+    @property
+    def permission(self) -> Verdict:
+        """The verdict; OK if the tracker is only lost, and a sensor along the needle measures it."""
+        sensed = self.expected is not None and self.expected.sensed
+        return OK if sensed and self.verdict.kind in _LOST else self.verdict
 
     def with_later_end(self, now: float, seconds: float) -> "TipWatch":
         """Extend the expected motion by `seconds`."""
@@ -118,8 +125,8 @@ class TrackedTip:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the last readings, or of their absence."""
-        return self._watch.verdict
+        """Of the last readings, or of their absence; see `TipWatch.permission`."""
+        return self._watch.permission
 
     @property
     def status(self) -> str:
