@@ -203,7 +203,9 @@ def make_problem(scenario: Scenario, session: Session, names: Sequence[str]) -> 
     """Return the fit of parameters by name. Raises as `calibrate`."""
     used = shallow(session)
     prepared, replay = fitting_scenario(scenario, used), Replay.of(used)
-    return Problem(prepared, parameters_of(prepared, names, replay.reached), replay)
+    read = {each.sensor for one in used.recordings for each in one.readings}
+    sensors = tuple(each for each in prepared.sensor if each.title in read)
+    return Problem(prepared, parameters_of(prepared, names, replay.reached), replay, sensors)
 
 
 def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:

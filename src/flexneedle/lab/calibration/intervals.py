@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2, t
 
-from flexneedle.lab.calibration.fit import Fitted, Problem, fit
+from flexneedle.lab.calibration.fit import Fitted, fit
 from flexneedle.lab.calibration.parameters import at_same_curvature
 from flexneedle.types import Floats
 
@@ -90,7 +90,8 @@ def _is_identified(fitted: Fitted, k: int, width: float) -> bool:
     the needle the entry alone identifies nothing but the bevel.
     """
     parameter = fitted.problem.parameters[k]
-    if width > parameter.useful or (parameter.name in _BY_MOTION and not fitted.problem.moves):
+    informed = fitted.problem.moves or bool(fitted.problem.sensors)
+    if width > parameter.useful or (parameter.name in _BY_MOTION and not informed):
         return False
     return parameter.name != "stiffness" or all(rise > SAME_COST for rise in _rises(fitted, k))
 
@@ -113,9 +114,7 @@ def fixed(fitted: Fitted, k: int, value: float, **limits: int) -> Fitted:
         layers = sum(each.name == "stiffness" for each in parameters)
         start = at_same_curvature(parameters, start, (value - start[k]) / layers)
     start[k] = value
-    return fit(
-        Problem(problem.scenario, parameters, problem.replay), fitted.criterion, start, fitted.noise, **limits
-    )
+    return fit(replace(problem, parameters=parameters), fitted.criterion, start, fitted.noise, **limits)
 
 
 def profile(fitted: Fitted, k: int, values: Sequence[float]) -> Floats:
