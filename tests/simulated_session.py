@@ -73,7 +73,7 @@ class Fibre:
     turn: float = 0.02
 
 
-def with_curvatures(session, scenario, angle=0.6, fibre=Fibre(), seed=9):  # noqa: B008
+def with_curvatures(session, scenario, angle=0.6, fibre=Fibre(), seed=9):
     """Return the session with curvatures of a fibre in the needle of a scenario, each step measured twice."""
     random, errors = np.random.default_rng(seed), fibre
     _, _, shapes = Replay.of(session).carry_out([true_needle(session, scenario, angle)], ("shapes",))

@@ -29,7 +29,11 @@ from flexneedle.types import THETA, Floats, Needles, Reading, X, Y
 _LASTING_MM = 20.0
 _START = (5.0, 0.1)  # standard deviations (mm, rad) of the unknown start, as of the tip (deviations.py)
 _SHIFT_MM, _TILT = 0.1, 1e-3  # steps of differences
-_FACTORS = (math.log(0.3), math.log(30.0))  # bounds of the factors on noise and model error
+_FACTORS = ((math.log(0.3), math.log(30.0)), (math.log(3.0), math.log(100.0)))
+"""Bounds of the factors on noise and model error. The identification fits base, bend and the modulus along the depth,
+too; without these the exact rod's curvature is up to 12 % off the model's (studies/calibration_sensors.py)."""
+FIRST_FACTORS = np.array([1.0, 3.0])
+"""Factors at the start of a fit."""
 _AT_REST = Timeline.of((), 0.0)
 _LEAST_SD = 1e-9  # of an offset that is known
 _HEAVY = 2.0  # standard deviations from which a residual counts less
@@ -129,7 +133,7 @@ class AlongPath:
     """Covariances of the residuals (r,) of a sensor in a recording.
 
     recording: its number; sensor: name; white (r,): variances of the means; model (r, r): of the model's error; fixed
-    (r, r): of offset, drift and start.
+    (r, r): of offset, drift and start; alike: insertions of the session, which have the same error of the model.
     """
 
     recording: int
@@ -137,17 +141,26 @@ class AlongPath:
     white: Floats
     model: Floats
     fixed: Floats
+    alike: int
 
-    def covariance(self, factors: Floats) -> Floats:
-        """Return the covariance (r, r), with factors (2,) on the standard deviations of noise and model error."""
-        found: Floats = factors[0] ** 2 * np.diag(self.white) + factors[1] ** 2 * self.model + self.fixed
+    def covariance(self, factors: Floats, alike: int = 1) -> Floats:
+        """Return the covariance (r, r), with factors (2,) on the standard deviations of noise and model error.
+
+        alike: number of insertions whose mean has the model's error of one.
+        """
+        found: Floats = (
+            factors[0] ** 2 * np.diag(self.white) + alike * factors[1] ** 2 * self.model + self.fixed
+        )
         return found
 
 
 def path_along(
-    means: StepMeans, one: Recording, shapes: Floats, length: float, target: float, found: Along
+    means: StepMeans, one: Recording, shapes: Floats, length: float, target: float, found: Along, alike: int
 ) -> AlongPath:
-    """Return the covariances about needles with shapes (k, n, 5); target: depth (mm) to which drifts refer."""
+    """Return the covariances about needles with shapes (k, n, 5); target: depth (mm) to which drifts refer.
+
+    alike: insertions of the session.
+    """
     fit, bins = means.fit, means.bins
     sensor, known = fit.sensor, bins.count > 0.0
     at = shapes[bins.index]
@@ -165,7 +178,7 @@ def path_along(
     white = (sensor.noise**2 / np.maximum(bins.count, 1.0) + sensor.wander_sd**2)[known]
     fixed = sensor.offset_sd**2 * offsets @ offsets.T + starts @ starts.T
     fixed += sensor.drift_sd**2 * grown * (drifts @ drifts.T)
-    return AlongPath(means.recording, fit.name, white, model, fixed)
+    return AlongPath(means.recording, fit.name, white, model, fixed, alike)
 
 
 def _starts(means: StepMeans, one: Recording, at: Floats, length: float, planned: Floats) -> Floats:
@@ -189,7 +202,7 @@ def estimate_factors(
     found = {}
     for name, start in first.items():
         own = [(path, left) for path, left in zip(paths, residuals, strict=True) if path.sensor == name]
-        ended = minimize(_loss, np.log(start), (own,), method="L-BFGS-B", bounds=[_FACTORS] * 2)
+        ended = minimize(_loss, np.log(start), (own,), method="L-BFGS-B", bounds=_FACTORS)
         found[name] = np.exp(ended.x)
     return found
 
@@ -218,7 +231,7 @@ class Joint:
     @classmethod
     def of(cls, tip: Criterion, paths: Sequence[AlongPath], factors: dict[str, Floats]) -> "Joint":
         """Return the criterion; factors: by sensor."""
-        roots = [np.linalg.cholesky(path.covariance(factors[path.sensor])) for path in paths]
+        roots = [np.linalg.cholesky(path.covariance(factors[path.sensor], path.alike)) for path in paths]
         rows = [solve_triangular(root, np.eye(len(root)), lower=True) for root in roots]
         return cls(tip, rows, 2.0 * sum(float(np.log(np.diag(root)).sum()) for root in roots))
 

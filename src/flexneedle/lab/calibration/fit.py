@@ -1,5 +1,6 @@
 """The fit: robust least squares of the errors of predictions ahead, alternating with the noise they follow from."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,6 +11,7 @@ from scipy.optimize import least_squares
 
 from flexneedle.estimation.along import SensorFit
 from flexneedle.lab.calibration.along import (
+    FIRST_FACTORS,
     Along,
     AlongPath,
     Joint,
@@ -196,9 +198,16 @@ def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
 def paths_along(problem: Problem, found: Residuals) -> list[AlongPath]:
     """Return the covariances of each sensor along the needle in each recording about the model's needles."""
     recordings, target = problem.replay.recordings, problem.scenario.target.depth_mm
+    sessions = Counter(one.session for one in recordings)
     return [
         path_along(
-            means, recordings[means.recording], found.shapes[means.recording], problem.length, target, each
+            means,
+            recordings[means.recording],
+            found.shapes[means.recording],
+            problem.length,
+            target,
+            each,
+            sessions[recordings[means.recording].session],
         )
         for means, each in zip(problem.means, found.along, strict=True)
     ]
@@ -281,7 +290,7 @@ def fit(
         problem = problem.with_means(residuals_at(problem, point, derivatives=False).shapes)
     found = residuals_at(problem, point)
     paths, along = paths_at(problem, found.tips), paths_along(problem, found)
-    factors = {each.sensor: np.ones(2) for each in along}
+    factors = {each.sensor: FIRST_FACTORS for each in along}
     for _ in range(rounds):
         before = point
         given = Joint.of(criterion.of(paths, noise, found.values), along, factors)

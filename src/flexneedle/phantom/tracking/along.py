@@ -1,12 +1,28 @@
 """Virtual sensors along the needle, on the true needle, with errors that the observer does not know."""
 
 import math
+from typing import Protocol
 
 import numpy as np
 
-from flexneedle.phantom.phantom import Phantom
 from flexneedle.scenario.sensors.sensor import Fault, Sensor, turn
-from flexneedle.types import VISIBLE, Floats, Matrix, Needles, Reading, X
+from flexneedle.types import VISIBLE, Floats, Matrix, Needles, Point, Reading, X
+
+
+class ShapeRecord(Protocol):
+    """The true needle over time, such as a `Phantom` that keeps its shapes."""
+
+    def now(self) -> float:
+        """Return the present time (s)."""
+        ...
+
+    def tip_at(self, time: float) -> Point:
+        """Return x, y, z (mm) of the tip at a time (s)."""
+        ...
+
+    def shape_at(self, time: float) -> tuple[Floats, float]:
+        """Return the poses (n, 5), at equal distances along the needle, and its roll (rad) at a time (s)."""
+        ...
 
 
 class VirtualSensor:
@@ -14,7 +30,7 @@ class VirtualSensor:
 
     Args:
         sensor: The sensor as the scenario describes it.
-        phantom: The phantom, which must keep its shapes.
+        phantom: The needle that it measures.
         axes: Lateral axes.
         depth: Depth (mm) of the target, at which a drift is complete.
         length: Length of the needle (mm).
@@ -24,7 +40,7 @@ class VirtualSensor:
     def __init__(
         self,
         sensor: Sensor,
-        phantom: Phantom,
+        phantom: ShapeRecord,
         axes: int,
         depth: float,
         length: float,
