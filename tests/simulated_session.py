@@ -76,7 +76,9 @@ class Fibre:
 def with_curvatures(session, scenario, angle=0.6, fibre=Fibre(), seed=9):
     """Return the session with curvatures of a fibre in the needle of a scenario, each step measured twice."""
     random, errors = np.random.default_rng(seed), fibre
-    _, _, shapes = Replay.of(session).carry_out([true_needle(session, scenario, angle)], ("shapes",))
+    needle, replay = true_needle(session, scenario, angle), Replay.of(session)
+    replay = replay.corrected(replay.predict([needle])[0][0])
+    _, _, shapes = replay.carry_out([needle], ("shapes",))
     offset = errors.offset * random.standard_normal((len(FIBRE["sites_mm"]), session.axes))
     return replace(
         session,
@@ -102,8 +104,12 @@ def curvatures(poses, gauge=5.0):
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)))
     tangent = CubicSpline(along, poses[:, :3]).derivative()
     sites = along[-1] - np.array(FIBRE["sites_mm"])
-    turned = tangent(sites + gauge / 2) - tangent(sites - gauge / 2)
-    return (turned[:, 1] + 1j * turned[:, 2]) / gauge
+
+    def tilt(at):
+        x, y, z = tangent(at).T
+        return np.arctan2(np.hypot(y, z), x) * np.exp(1j * np.arctan2(z, y))
+
+    return (tilt(sites + gauge / 2) - tilt(sites - gauge / 2)) / gauge
 
 
 def without_slopes(session):

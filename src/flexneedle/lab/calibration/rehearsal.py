@@ -136,8 +136,8 @@ class Rests:
         return _STEP_S * len(self.poses) - 1e-6
 
     def step(self, time: float) -> int:
-        """Return the number of the needle at a time (s)."""
-        return min(max(int(time / _STEP_S + 1e-9), 0), len(self.poses) - 1)
+        """Return the number of the needle at a time (s), in whole seconds, as clocks are wrong by less."""
+        return min(int(round(time) // _STEP_S), len(self.poses) - 1)
 
     def tip_at(self, time: float) -> Point:
         """Return x, y, z (mm) of the tip."""
