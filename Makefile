@@ -172,6 +172,7 @@ front: setup  ## error against peak tissue energy of five controllers and the or
 calibration: setup  ## fits of 100 sets of simulated recordings, and 50 closed loops without and with a calibration (half an hour)
 	$(BIN)/python studies/calibration.py sets $(call quick,--count 1)
 	$(BIN)/python studies/calibration.py loops $(call quick,--count 1)
+	$(BIN)/python studies/calibration_sensors.py $(call quick,--count 1)
 
 wide: setup  ## 200 random worlds from soft tissue to stiff gel with four controllers, and the report (DIR=runs/wide; hours)
 	$(call study,wide,$(OUT))

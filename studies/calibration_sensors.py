@@ -1,4 +1,4 @@
-"""What sensors along the needle identify in a calibration that the tip alone does not, on simulated phantoms.
+"""Calibration with sensors along the needle and by the tip alone, on simulated phantoms.
 
     python studies/calibration_sensors.py [--first N] [--count N] [--jobs N]
 

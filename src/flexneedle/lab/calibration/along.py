@@ -6,8 +6,8 @@ of each site. The residuals of an insertion have, by the values of a sensor, the
     a² noise + b² model + offset + drift + start
 
 white noise of the means at a step, an error of the model that is correlated over `_LASTING_MM` of advance, an offset
-and a drift of that insertion, and the lateral position and heading with which the needle begins, which are unknown as
-those of the tip. The factors a and b follow from the residuals, by the greatest likelihood.
+and a drift of that insertion, and the lateral position and heading with which the needle begins, which are unknown for
+the tip, too. The factors a and b follow from the residuals, by the greatest likelihood.
 """
 
 import math

@@ -227,8 +227,8 @@ class SensorMap(Section):
     time: TimeMap | None = None
     """Time of a reading, on the clock of the tip. Not set: columns and units of `[time]`."""
     curvature: Columns = ()
-    """Columns of the curvature towards y of each site, from the tip on; in space of y, then z at each site. Axes are
-    those of the needle's frame where the roll is 0."""
+    """Columns of the curvature towards y of each site, from the tip on; in space of y, then z at each site. Axes: the
+    needle's frame where the roll is 0."""
     curvature_unit: Literal["1/m", "1/mm"] = "1/m"
     """Unit of the curvatures."""
     position: Columns = ()

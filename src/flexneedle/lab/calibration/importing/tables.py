@@ -17,7 +17,7 @@ _PARQUET, _MAT, _HDF = b"PAR1", b"MATLAB 5.0 MAT-file", b"\x89HDF"
 
 
 class Columns(Protocol):
-    """The columns of a table: a `RecordingMap`, or those of a sensor."""
+    """The columns of a table: a `RecordingMap`, or a sensor's."""
 
     @property
     def numbers(self) -> tuple[str, ...]:
