@@ -21,11 +21,14 @@ import numpy as np
 from calibration import draw_schedules, guided_world, judge, percent, with_true_values
 from flexneedle import Scenario
 from flexneedle.errors import ScenarioWarning
+from flexneedle.lab.calibration.along import StepMeans
 from flexneedle.lab.calibration.calibration import calibrate
 from flexneedle.lab.calibration.rehearsal import Rehearsal, Schedule
 from flexneedle.phantom.draw import Truth
 
 FIT = ("stiffness", "bevel", "clearance")
+BENT = 0.5
+"""Curvature (1/m) that divides the sets."""
 GUIDES = ("at rest", "moved")
 SENSORS: dict[str, dict[str, Any]] = {
     "tip alone": {},
@@ -65,7 +68,13 @@ def _rows(number: int) -> Iterator[dict[str, Any]]:
             found = calibrate(with_sensor(scenario, kind, depth), session, FIT)
             fitted, rows = found.fitted, found.fitted.tip_errors
             spread = [fitted.sds_by(part)[0] for part in (slice(rows), slice(rows, None), slice(None))]
-            yield {"guide": guide, "kind": kind, "spread": spread, **judge(found, true)}
+            bent = max((curvature(means) for means in fitted.problem.means), default=0.0)
+            yield {"guide": guide, "kind": kind, "spread": spread, "bent": bent, **judge(found, true)}
+
+
+def curvature(means: StepMeans) -> float:
+    """Return the largest curvature (1/m) of a site, root mean square over an insertion."""
+    return 1e3 * float(np.sqrt(np.mean(means.bins.value**2, axis=0)).max())
 
 
 def summarize(rows: Sequence[dict[str, Any]]) -> str:
@@ -85,6 +94,16 @@ def summarize(rows: Sequence[dict[str, Any]]) -> str:
             cells = [guide, kind, len(own), len(known), f"{error:.3f}", covered]
             problems = sum(bool(row["problems"]) for row in own)
             lines.append(f"|{'|'.join(map(str, [*cells, percent(own, 'bevel_covered'), spread, problems]))}|")
+    still = [row for row in rows if (row["guide"], row["kind"]) == ("at rest", "with a fibre")]
+    for text, part in (
+        (f"from {BENT} 1/m", [row for row in still if row["bent"] >= BENT]),
+        ("less", [row for row in still if row["bent"] < BENT]),
+    ):
+        known = [row["stiffness_error"] for row in part if row["stiffness_identified"]]
+        error = np.sqrt(np.mean(np.square(known))) if known else np.nan
+        lines.append(
+            f"\nFibre at rest, curvature {text}: {len(known)} of {len(part)} identified, rms error {error:.3f}"
+        )
     return "\n".join(lines)
 
 

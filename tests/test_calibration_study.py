@@ -195,7 +195,7 @@ def test_sensors_are_placed_for_the_depth_of_the_insertions():
 
 
 def test_the_table_of_sensors_counts_identified_stiffness_only():
-    row = {"spread": [0.4, 0.2, 0.1], "bevel_covered": True, "problems": []}
+    row = {"spread": [0.4, 0.2, 0.1], "bevel_covered": True, "problems": [], "bent": 0.6}
     known = row | {"stiffness_identified": True, "stiffness_error": 0.3, "stiffness_covered": True}
     other = known | {"stiffness_identified": False, "stiffness_error": 9.0, "stiffness_covered": False}
     rows = [
@@ -205,5 +205,5 @@ def test_the_table_of_sensors_counts_identified_stiffness_only():
         for each in (known, other)
     ]
     lines = calibration_sensors.summarize(rows).splitlines()
-    assert len(lines) == 10
+    assert lines[11] == "Fibre at rest, curvature from 0.5 1/m: 1 of 2 identified, rms error 0.300"
     assert lines[2] == "|at rest|tip alone|2|1|0.300|100 %|100 %|0.40, 0.20, 0.10|0|"
