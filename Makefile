@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl fuzz-fbgs robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slicer docs lint clean
+.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl fuzz-fbgs robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms sensors wide worlds space worlds-space tuning slicer docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -10,7 +10,9 @@ PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 # Targets that run scripts, each with a quick mode.
-SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl fuzz-fbgs robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms wide worlds space worlds-space tuning slow docs
+SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros fuzz-igtl fuzz-fbgs robustness validation accuracy controllers studies tracker steering far-targets plan-reach tilted-skin front calibration rooms sensors wide worlds space worlds-space tuning slow docs
+
+comma := ,
 
 # With QUICK=1 each of them does everything that it does, on a few cases, in seconds; results go to a temporary folder.
 quick = $(if $(QUICK),$(1))
@@ -173,6 +175,9 @@ calibration: setup  ## fits of 100 sets of simulated recordings, and 50 closed l
 	$(BIN)/python studies/calibration.py sets $(call quick,--count 1)
 	$(BIN)/python studies/calibration.py loops $(call quick,--count 1)
 	$(BIN)/python studies/calibration_sensors.py $(call quick,--count 1)
+
+sensors: setup  ## insertions with sensors along the needle, healthy and faulty, in 140 random worlds (hours)
+	$(BIN)/python studies/sensors.py --out $(OUT) $(call quick,--worlds 100001 1 --unguided 0 --rows "lost$(comma) fbg")
 
 wide: setup  ## 200 random worlds from soft tissue to stiff gel with four controllers, and the report (DIR=runs/wide; hours)
 	$(call study,wide,$(OUT))

@@ -1,13 +1,14 @@
 """Insertions with sensors along the needle, healthy and faulty, in random worlds in space on the exact plant.
 
-Each row is a set of sensors with an error or a fault. Sites, planes, gains, offsets and faults are drawn for each world,
-others than those of the scenario. The table has the lateral error of the estimate and the distance from the target.
+Each row is a set of sensors with an error or a fault. Sites, planes, gains and faults are drawn for each world.
+The table has the lateral distance from the target and the lateral error of the estimate, in mm, and the share of ends
+within the 95 % region of the tip.
 
     python studies/sensors.py --worlds 100000 20 --out runs/sensors
 """
 
 import argparse
-import csv
+import json
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -29,11 +30,12 @@ _PLANES = (0.15, 0.9)
 
 
 class Row(NamedTuple):
-    """Sensors with an error or a fault, and the changes of a scenario that make them."""
+    """Sensors with an error or a fault: their part of a scenario, its other changes, and whether only with a guide."""
 
     name: str
-    changes: Callable[[Any, np.random.Generator], dict[str, Any]]
-    guided: tuple[bool, ...] = (True, False)
+    sensors: Callable[[Any, np.random.Generator], list[dict[str, Any]]]
+    changes: Callable[[Any], dict[str, Any]] = lambda _scenario: {}
+    guided_only: bool = False
 
 
 def fbg(scenario: Any, rng: np.random.Generator, **more: Any) -> dict[str, Any]:
@@ -61,62 +63,71 @@ def slices(scenario: Any, rng: np.random.Generator, **more: Any) -> list[dict[st
     ]
 
 
-def _bias(rng: np.random.Generator, share: float = 1.0) -> dict[str, Any]:
-    size = float(rng.uniform(0.0, BIAS_MM)) if share < 1.0 else BIAS_MM
-    return {"phantom.tracker_bias_mm": size, "tracker.bias_sd_mm": 0.5 * BIAS_MM, **_HOMED}
+HOMED = {"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0}
+BIASED = {"phantom.tracker_bias_mm": BIAS_MM, "tracker.bias_sd_mm": 0.5 * BIAS_MM, **HOMED}
+GROWS = {"phantom.tracker_drift_mm": BIAS_MM, **HOMED}
 
 
-_HOMED = {"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0}
-_GROWS = {"phantom.tracker_drift_mm": BIAS_MM, **_HOMED}
-_DECLARED = {"tracker.field_sd_mm": 2.0}
+def no_sensor(_scenario: Any, _rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Return no sensor besides the tracker."""
+    return []
 
 
-def _fault(scenario: Any, rng: np.random.Generator, kind: str, size: float) -> dict[str, Any]:
-    """Return the keys of a sensor with a fault, which begins between a fifth and a half of the way."""
+def one_fibre(scenario: Any, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Return a healthy fibre."""
+    return [fbg(scenario, rng)]
+
+
+def faulty(
+    sensor: dict[str, Any], scenario: Any, rng: np.random.Generator, kind: str, size: float
+) -> dict[str, Any]:
+    """Return a sensor with a fault, which begins between a fifth and a half of the way."""
     depth = float(rng.uniform(0.2, 0.5)) * scenario.target.depth_mm
-    return {"phantom": {"fault": {"kind": kind, "depth_mm": depth, "size": size}}}
+    return {**sensor, "phantom": {"fault": {"kind": kind, "depth_mm": depth, "size": size}}}
 
 
-def faulty_slices(scenario: Any, rng: np.random.Generator, kind: str, size: float) -> list[dict[str, Any]]:
-    """Return two image planes, the first of which has a fault."""
-    first, second = slices(scenario, rng)
-    first["plane_mm"] = 0.1 * scenario.target.depth_mm
-    return [{**first, **_fault(scenario, rng, kind, size)}, second]
+def faulty_fibre(kind: str, size: float) -> Callable[[Any, np.random.Generator], list[dict[str, Any]]]:
+    """Return a function that draws a fibre with a fault."""
+    return lambda scenario, rng: [faulty(fbg(scenario, rng), scenario, rng, kind, size)]
 
 
-def _lost(scenario: Any) -> dict[str, Any]:
+def faulty_slice(kind: str, size: float) -> Callable[[Any, np.random.Generator], list[dict[str, Any]]]:
+    """Return a function that draws two image planes, of which the first, near the skin, has a fault."""
+
+    def draw_planes(scenario: Any, rng: np.random.Generator) -> list[dict[str, Any]]:
+        first, second = slices(scenario, rng)
+        first["plane_mm"] = 0.1 * scenario.target.depth_mm
+        return [faulty(first, scenario, rng, kind, size), second]
+
+    return draw_planes
+
+
+def lost(scenario: Any) -> dict[str, Any]:
+    """Return the changes by which the tracker is lost half-way."""
     return {"phantom.tracker_lost_mm": 0.5 * scenario.target.depth_mm}
 
 
 ROWS = (
-    Row("em", lambda s, r: {}),
-    Row("em + fbg", lambda s, r: {"sensor": [fbg(s, r)]}),
-    Row("em + slices", lambda s, r: {"sensor": slices(s, r)}),
-    Row("bias", lambda s, r: _bias(r)),
-    Row("bias, fbg", lambda s, r: {"sensor": [fbg(s, r)], **_bias(r)}),
-    Row("bias, slices", lambda s, r: {"sensor": slices(s, r), **_bias(r)}),
-    Row("grows", lambda s, r: {"sensor": [fbg(s, r)], **_GROWS, **_DECLARED}, (True,)),
-    Row("grows, undeclared", lambda s, r: {"sensor": [fbg(s, r)], **_GROWS}, (True,)),
-    Row("lost", lambda s, r: _lost(s)),
-    Row("lost, fbg", lambda s, r: {"sensor": [fbg(s, r)], **_lost(s)}),
-    Row("lost, slices", lambda s, r: {"sensor": slices(s, r), **_lost(s)}),
+    Row("em", no_sensor),
+    Row("em + fbg", one_fibre),
+    Row("em + slices", slices),
+    Row("bias", no_sensor, lambda _: BIASED),
+    Row("bias, fbg", one_fibre, lambda _: BIASED),
+    Row("bias, slices", slices, lambda _: BIASED),
+    Row("grows", one_fibre, lambda _: {**GROWS, "tracker.field_sd_mm": 2.0}, True),
+    Row("grows, undeclared", one_fibre, lambda _: GROWS, True),
+    Row("lost", no_sensor, lost),
+    Row("lost, fbg", one_fibre, lost),
+    Row("lost, slices", slices, lost),
     *(
-        Row(
-            f"fbg {kind}",
-            lambda s, r, kind=kind, size=size: {"sensor": [fbg(s, r, **_fault(s, r, kind, size))]},
-            (True,),
-        )
+        Row(f"fbg {kind}", faulty_fibre(kind, size), guided_only=True)
         for kind, size in (("drift", 0.4), ("frozen", 1.0), ("outliers", 0.3), ("delayed", 0.1))
     ),
     *(
-        Row(
-            f"slices {kind}",
-            lambda s, r, kind=kind, size=size: {"sensor": faulty_slices(s, r, kind, size)},
-            (True,),
-        )
+        Row(f"slices {kind}", faulty_slice(kind, size), guided_only=True)
         for kind, size in (("drift", 0.4), ("frozen", 1.0))
     ),
-    Row("fbg alone", lambda s, r: {"sensor": [fbg(s, r)], "tracker.enabled": False, **_HOMED}, (True,)),
+    Row("fbg alone", one_fibre, lambda _: {"tracker.enabled": False, **HOMED}, True),
 )
 
 
@@ -127,7 +138,7 @@ def run_case(number: int, guided: bool, name: str) -> dict[str, Any]:
     scenario = world(number, "real", rig)
     rng = np.random.default_rng([44, number])
     plan = flexneedle.plan(scenario, seed=0, threads=1)
-    changed = scenario.with_values(row.changes(scenario, rng))
+    changed = scenario.with_values({"sensor": row.sensors(scenario, rng), **row.changes(scenario)})
     estimates: list[Any] = []
     insertion = flexneedle.insert(
         changed,
@@ -178,6 +189,37 @@ def measure(insertion: Any, plan: Any) -> dict[str, Any]:
         "sensors": "; ".join(f"{one.name}: {one.verdict}" for one in last.sensors if not one.verdict.ok),
         "reason": insertion.reason,
     }
+
+
+def draw_figure(results: list[dict[str, Any]], path: Path) -> None:
+    """Draw the distances from the target of each row, and the holds, with a guide and without."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.5, 5.5), layout="constrained")
+    for axes, guided in zip(figure.subplots(1, 2, sharey=True), (True, False), strict=True):
+        names = [row.name for row in ROWS]
+        for k, name in enumerate(names):
+            mine = [one for one in results if one["row"] == name and one["guided"] == guided]
+            done = [one["miss"] for one in mine if one["outcome"] == "done"]
+            axes.plot(done, np.full(len(done), k), "|", color="#0b6e99", ms=9, alpha=0.6)
+            if done:
+                axes.plot(np.median(done), k, "o", color="#b03a2e", ms=4)
+            if mine:
+                axes.text(
+                    1.01,
+                    k,
+                    f"{len(mine) - len(done)}",
+                    transform=axes.get_yaxis_transform(),
+                    va="center",
+                    size=7,
+                )
+        axes.set(xscale="log", xlim=(1e-3, 10.0), xlabel="distance of the tip from the target, lateral (mm)")
+        axes.set_title(f"{'With' if guided else 'Without'} a guide (right: held)", size=9, loc="left")
+        axes.set_yticks(range(len(names)), names, size=8)
+        axes.axvline(1.0, color="0.7", lw=0.8)
+        axes.grid(axis="x", color="0.9", lw=0.6)
+    axes.invert_yaxis()
+    figure.savefig(path, dpi=150)
 
 
 def _worlds(first: int, count: int, guided: bool) -> Iterator[int]:
@@ -240,27 +282,27 @@ def main() -> None:
         for guided, number_of in ((True, count), (False, without))
         for number in _worlds(first, number_of, guided)
         for row in ROWS
-        if row.name in chosen.rows and guided in row.guided
+        if row.name in chosen.rows and (guided or not row.guided_only)
     ]
     chosen.out.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(chosen.workers) as pool:
+    with ProcessPoolExecutor(chosen.workers) as pool, (chosen.out / "rows.jsonl").open("w") as file:
         jobs = {pool.submit(run_case, *case): case for case in cases}
         for done, job in enumerate(as_completed(jobs), 1):
             try:
                 results.append(job.result())
+                file.write(json.dumps(results[-1]) + "\n")
+                file.flush()
             except FlexneedleError as error:
                 print(f"{jobs[job]}: {error}", file=sys.stderr)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
             print(f"\r{done} of {len(cases)}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    results.sort(key=lambda one: (one["world"], one["row"]))
-    if results:
-        with (chosen.out / "rows.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, results[0])
-            writer.writeheader()
-            writer.writerows(results)
     text = table(results)
     (chosen.out / "table.txt").write_text(text + "\n", encoding="utf-8")
+    draw_figure(results, chosen.out / "sensors.png")
     print(text)
 
 

@@ -35,7 +35,7 @@ POSITIVE = _keys("""
     setup: base_speed_mm_s base_turn_speed_mrad_s rotation_speed_deg_s max_rotation_deg
     tissue[0]: thickness_mm compression_length_mm
     tissue[1]: shear_modulus_kpa engaged_width_mm
-    tracker: direction_jitter_mrad rate_hz
+    tracker: direction_jitter_mrad field_length_mm rate_hz
 """)
 _WEIGHTS = {"plan": PLAN, "control.ce_mpc": CE_MPC, "control.adaptive_mpc": ADAPTIVE_MPC}
 NOT_NEGATIVE = [f"{section}.{weight.key}" for section, cost in _WEIGHTS.items() for weight in cost.settings()]
@@ -51,17 +51,17 @@ NOT_NEGATIVE += _keys("""
     entry: free_radius_mm free_slope_mrad
     guard: zone_buffer_mm
     image: sd_mm
-    monitor: jump_margin_mm lost_after_s
+    monitor: error_per_indicator_mm jump_margin_mm lost_after_s
     needle: inner_diameter_mm
     needle.bevel: offset_mm
     phantom: shear_modulus_variation layer_shift_sd_mm start_offset_sd_mm start_angle_sd_mrad start_offset_z_sd_mm
     phantom: start_angle_z_sd_mrad direction_spread_deg start_axial_sd_mm youngs_modulus_variation initial_bend_mm
     phantom: run_out_mm guide_clearance_mm friction_mn_per_mm rotation_friction_mn motor_resolution_mm
-    phantom: delay_periods missing_fraction tracker_bias_mm
+    phantom: delay_periods missing_fraction tracker_bias_mm tracker_drift_mm
     phantom.structure: spring_back_mm
     plan: advance_sigma_mm guide_sigma_mm base_sigma_mm base_turn_sigma_mrad smoothing
     tissue[0]: energy_weight
-    tracker: jitter_mm tip_offset_mm
+    tracker: bias_sd_mm field_sd_mm jitter_mm tip_offset_mm
     zones: margin_mm
 """)
 COUNTS = {
@@ -90,6 +90,7 @@ RULES = [
     ("needle.nodes", 61.5, "must be a whole number"),
     ("needle.nodes", True, "must be a whole number"),
     ("needle.stylet", 1, "must be true or false"),
+    ("control.essential_points", 1, "must be true or false"),
     ("needle.bevel", 4.0, "must be a table"),
     ("needle", "21G", "must be a table"),
     ("tissue", {"alpha": 1.0}, "must be a list: write [[tissue]]"),
@@ -186,7 +187,7 @@ RULES = [
     (
         "control.load_gian",
         0.3,
-        "unknown key; did you mean load_gain? valid keys: load_gain, depth_tolerance_mm,",
+        "unknown key; did you mean load_gain? valid keys: load_gain, essential_points, depth_tolerance_mm,",
     ),
     ("control.ce_mpc.horizn", 3, "unknown key; did you mean horizon? valid keys: curvature_per_m,"),
     ("control.broyden_mpc", 3, "unknown key; valid keys: load_gain,"),

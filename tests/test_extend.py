@@ -81,8 +81,17 @@ def insert(scenario, plan, controller, phantom, tracker):
 
 
 def test_each_example_is_one_short_file():
-    assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench", "fung", "tilt", "test_parts"]
-    assert all(len(code.splitlines()) < 42 for code in MODULES.values())
+    assert list(MODULES) == [
+        "follow_path",
+        "unicycle",
+        "camera",
+        "proximity",
+        "bench",
+        "fung",
+        "tilt",
+        "test_parts",
+    ]
+    assert all(len(code.splitlines()) < 47 for code in MODULES.values())
 
 
 def test_the_parts_pass_their_kits(lab, imported):
@@ -120,6 +129,24 @@ def test_an_unused_controller_table_is_one_warning(lab):
         (line,) = [line for line in done.stderr.splitlines() if "follow_path" in line]
         assert line.startswith("flexneedle: control.follow_path: unknown table; tables: adaptive_mpc, ")
         assert line.endswith("; it is not used")
+
+
+@pytest.mark.long
+def test_a_sensor_by_name_is_used_recorded_and_drawn(lab):
+    near = 'kind = "proximity:Proximity"'
+    scenario = (lab / "quick.toml").read_text(encoding="utf-8")
+    (lab / "near.toml").write_text(f"{scenario}\n[[sensor]]\n{near}\nat_mm = 2.0\n", encoding="utf-8")
+    done = command(lab, "insert", "near.toml", "--force", "--json", "--out", "near")
+    result, stored = json.loads(done.stdout), json.loads((lab / "near/run.json").read_text())
+    assert result["outcome"] == "done", done.stderr
+    (sensor,) = result["sensors"]
+    assert sensor["name"] == "Proximity"
+    assert 0.0 < sensor["mean_nis"] < 3.0
+    assert stored["scenario"]["sensor"][0]["kind"] == "proximity:Proximity"
+    again = command(lab, "view", "near")
+    assert again.returncode == 0, again.stderr
+    readings = command(lab, "export", "near", "--sensors", "-")
+    assert ",Proximity," in readings.stdout
 
 
 def test_objects_give_the_same_result_as_their_names(lab, imported, monkeypatch):

@@ -1,12 +1,14 @@
 from bench import Bench
 from camera import Camera
 from follow_path import CONTROLLER
+from proximity import Proximity
 from unicycle import Unicycle
 
 from flexneedle.testing import (
     ControllerConformance,
     DriverConformance,
     PlantConformance,
+    SensorConformance,
     TipTrackerConformance,
 )
 
@@ -24,6 +26,11 @@ class TestUnicycle(PlantConformance):
 class TestCamera(TipTrackerConformance):
     def make(self, scenario, phantom, rng):
         return Camera(scenario, phantom, rng)
+
+
+class TestProximity(SensorConformance):
+    def make(self):
+        return Proximity(kind="proximity:Proximity", at_mm=5.0)
 
 
 class TestBench(DriverConformance):

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from flexneedle.phantom.plants import Plant
     from flexneedle.planning.events import Event, Iterated
     from flexneedle.planning.planner import plan
-    from flexneedle.ports import Clock, Driver, TipTracker
+    from flexneedle.ports import Clock, Driver, NeedleSensor, TipTracker
     from flexneedle.record.export import to_dataframe
     from flexneedle.record.figures import plot
     from flexneedle.record.loading import load
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from flexneedle.scenario.files import load_scenario
     from flexneedle.scenario.model import Scenario
     from flexneedle.scenario.sections.fields import Section
+    from flexneedle.scenario.sensors.sensor import Sensor
     from flexneedle.scenario.tissue.layer import Layer
     from flexneedle.simulator.control import controls
     from flexneedle.simulator.simulator import Simulator
@@ -64,7 +65,9 @@ if TYPE_CHECKING:
         Control,
         Measurement,
         Motion,
+        Needles,
         Pose,
+        Reading,
         X,
         Y,
         Z,
@@ -104,11 +107,14 @@ __all__ = [
     "Layer",
     "Measurement",
     "Motion",
+    "NeedleSensor",
+    "Needles",
     "PeriodEnded",
     "Plan",
     "Planned",
     "Plant",
     "Pose",
+    "Reading",
     "Rig",
     "RigError",
     "RunError",
@@ -116,6 +122,7 @@ __all__ = [
     "ScenarioError",
     "ScenarioWarning",
     "Section",
+    "Sensor",
     "Simulator",
     "State",
     "StateError",
@@ -164,7 +171,7 @@ _HOMES = {
     "phantom.plants": "Plant",
     "planning.events": "Event Iterated",
     "planning.planner": "plan",
-    "ports": "Clock Driver TipTracker",
+    "ports": "Clock Driver NeedleSensor TipTracker",
     "record.export": "to_dataframe",
     "record.figures": "plot",
     "record.loading": "load",
@@ -173,11 +180,13 @@ _HOMES = {
     "scenario.files": "load_scenario",
     "scenario.model": "Scenario",
     "scenario.sections.fields": "Section",
+    "scenario.sensors.sensor": "Sensor",
     "scenario.tissue.layer": "Layer",
     "simulator.control": "controls",
     "simulator.simulator": "Simulator",
     "simulator.state": "State",
-    "types": "DB_PSI DB_THETA DB_X DB_Y DB_Z DG_Y DG_Z PSI ROLL SPIN THETA X Y Z Control Measurement Motion Pose",
+    "types": "DB_PSI DB_THETA DB_X DB_Y DB_Z DG_Y DG_Z PSI ROLL SPIN THETA X Y Z Control Measurement Motion Needles "
+    "Pose Reading",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 

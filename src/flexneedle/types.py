@@ -326,6 +326,15 @@ class Needles(NamedTuple):
     poses: Floats
     spacing: float
 
+    def at(self, x: float) -> Floats:
+        """Return the poses (m, 5) where needles pass x (mm), straight on beyond their ends."""
+        last, rows = self.poses.shape[1] - 2, np.arange(len(self.poses))
+        left = np.clip((self.poses[..., X] <= x).sum(axis=1) - 1, 0, last)
+        start, end = self.poses[rows, left], self.poses[rows, left + 1]
+        part = (x - start[:, X]) / (end[:, X] - start[:, X])
+        found: Floats = start + part[:, None] * (end - start)
+        return found
+
     @property
     def points(self) -> Floats:
         """x, y, z (m, n, 3), mm."""

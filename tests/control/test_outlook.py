@@ -20,6 +20,7 @@ def linear(precision, curves, now=0.0, variance=1e-3):
     """Outlook and estimate of a linear problem: the tip is the sum of the parameters times their curves (K, g)."""
     setup = SimpleNamespace(max_advance_mm=1.0)
     estimate = SimpleNamespace(
+        tracked=True,
         precision=np.asarray(precision),
         reading_variance=variance,
         nominal=SimpleNamespace(scenario=SimpleNamespace(setup=setup)),

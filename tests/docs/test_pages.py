@@ -131,10 +131,11 @@ def test_few_blocks_are_not_run_and_each_has_a_reason():
     skipped = [(name, b.skipped) for name, found in BLOCKS.items() for b in found if b.skipped]
     assert {reason for _, reason in skipped} <= {
         "installs into an environment of yours",
+        "a scenario with a fibre whose time stamps are late",
         "needs an Aurora",
         "runs until Ctrl-C",
     }
-    assert len(skipped) < 12
+    assert len(skipped) < 13
 
 
 def test_the_files_that_the_readme_links_exist():

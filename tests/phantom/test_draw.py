@@ -23,6 +23,8 @@ PLANAR = ("base_y", "base_turn", "bend", "run_out", "bias", "variation")
 OUT = ("base_z", "base_psi", "bend_angle", "run_out_angle")
 # Keys of [phantom]: another value, and the values of the true phantom that may change.
 CHANGED = {
+    "tracker_drift_mm": (1.0, {"drift"}),
+    "tracker_lost_mm": (10.0, set()),
     "shear_modulus_factor": ([1.2, 3.2], {"layers"}),
     "shear_modulus_variation": (0.4, {"variation"}),
     "variation_length_mm": (20.0, {"variation"}),
@@ -64,7 +66,7 @@ def entries(truth):
         "bevel": needle.bevel.offset_mm / PHANTOM.needle.bevel.offset_mm,
         "start": axial_error(truth),
         "modulus": needle.youngs_modulus_gpa / PHANTOM.needle.youngs_modulus_gpa,
-        **{name: getattr(truth, name) for name in (*PLANAR, *OUT)},
+        **{name: getattr(truth, name) for name in (*PLANAR, *OUT, "drift")},
     }
 
 

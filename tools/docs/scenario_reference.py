@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 from flexneedle.control.controller_tables import scenario_class
 from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.scenario.sensors.kinds import KINDS
+from flexneedle.scenario.sensors.sensor import Sensor
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "reference" / "scenario.md"
@@ -21,17 +23,19 @@ _UNITS = {
     "_mn_per_mm": "mN/mm", "_mrad_per_mm": "mrad/mm", "counts_per_mm": "counts/mm", "counts_per_deg": "counts/°",
     "_mm_s2": "mm/s²", "_deg_s2": "°/s²", "_mm_s": "mm/s", "_deg_s": "°/s", "_per_mm": "1/mm", "_per_mj": "1/mJ",
     "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_ms": "ms", "_s": "s",
-    "_mn": "mN", "_deg": "°",
+    "_mn": "mN", "_deg": "°", "_px": "px",
 }  # fmt: skip
 _LARGEST = 1e6
+SENSOR = "sensor"
 
 
 class Key(NamedTuple):
-    """A key of a section: dotted name, JSON schema, and whether a scenario must have it."""
+    """A key of a section: dotted name, JSON schema, and whether a scenario must have it; shown: not its last part."""
 
     name: str
     schema: dict[str, Any]
     required: bool
+    shown: str = ""
 
 
 class Table(NamedTuple):
@@ -71,6 +75,8 @@ def wrap(introduction: str, sections: str) -> str:
 
 def heading(table: Table) -> str:
     """Return the heading of a section."""
+    if table.name.removeprefix(f"{SENSOR}.") in KINDS:
+        return f"## `[[{SENSOR}]]`, `{table.name.removeprefix(f'{SENSOR}.')}`"
     name = (
         f"[[{table.name}]]"
         if table.name.endswith(("tissue", "terms", "zone", "layer", "sensor"))
@@ -88,6 +94,9 @@ def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[
     keys, inner = [], []
     for short, value in node["properties"].items():
         full = f"{name}.{short}" if name else short
+        if full == SENSOR and all(sensor.__name__ in known for sensor in KINDS.values()):
+            inner.append((full, None))
+            continue
         found = _table_of(value, known)
         if found is None:
             keys.append(Key(full, value, short in node.get("required", [])))
@@ -95,7 +104,29 @@ def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[
             inner.append((full, found))
     yield Table(name, node.get("description", ""), tuple(keys))
     for full, found in inner:
-        yield from _tables(full, found, known)
+        yield from _sensor_tables(known) if found is None else _tables(full, found, known)
+
+
+def _sensor_tables(known: dict[str, Any]) -> Iterator[Table]:
+    """Yield the keys of all kinds of sensors along the needle, then the keys of each kind that differ."""
+    base = Sensor.model_json_schema()
+    about = {"description": "Keys of all kinds of sensors along the needle."}
+    yield from _tables(SENSOR, base | about, base["$defs"])
+    errors = base["$defs"]["SensorErrors"]["properties"]
+    for kind, sensor in KINDS.items():
+        node = known[sensor.__name__]
+        phantom = known[node["properties"]["phantom"]["$ref"].rsplit("/", 1)[1]]
+        keys = [
+            Key(f"{SENSOR}.{short}", value, short in node["required"])
+            for short, value in node["properties"].items()
+            if short not in ("kind", "phantom") and value != base["properties"].get(short)
+        ]
+        keys += [
+            Key(f"{SENSOR}.phantom.{short}", value, False, f"phantom.{short}")
+            for short, value in phantom["properties"].items()
+            if short not in errors
+        ]
+        yield Table(f"{SENSOR}.{kind}", node["description"], tuple(keys))
 
 
 def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
@@ -138,7 +169,7 @@ def _row(key: Key, advice: dict[str, Any]) -> str:
     text = " ".join(key.schema.get("description", "").split())
     if choose := key.schema.get("choose") or advice["keys"].get(key.name):
         text += f" *{choose[:1].upper()}{choose[1:]}*"
-    short = key.name.rsplit(".", 1)[-1]
+    short = key.shown or key.name.rsplit(".", 1)[-1]
     cells = (f"`{short}`", _default(key), allowed(key.schema), text)
     return f"|{'|'.join(cell.replace('|', chr(92) + '|') for cell in cells)}|"
 

@@ -149,6 +149,10 @@ def _insert(args: argparse.Namespace) -> int:
                 print_note(
                     f"{choices.controller.name} does not avoid zones: only the guard holds the needle before one"
                 )
+            if scenario.sensor and not choices.controller.fuses and not scenario.control.essential_points:
+                print_note(
+                    f"{choices.controller.name} does not use sensors along the needle: they are recorded only"
+                )
             scenario = connection.start(stack, scenario)
             compile_first(scenario.setup.axes)
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)

@@ -172,6 +172,11 @@ class Controller:
         return f"<Controller {self.name}: {self.summary}>"
 
     @property
+    def fuses(self) -> bool:
+        """Whether its observer is corrected by sensors along the needle, too; else they are recorded only."""
+        return bool(getattr(self.observer, "fuses", False))
+
+    @property
     def table(self) -> str:
         """Name of its table below `control`."""
         return self.name.replace("-", "_")

@@ -48,6 +48,14 @@ def check_guide(controller: Controller, setup: Setup, strategy: str) -> None:
     raise InputError(f"{name}, strategy = {strategy!r} does not move it: use 'manipulation'")
 
 
+def check_tracker(controller: Controller, scenario: Scenario) -> None:
+    """Raise InputError if a controller that does not fuse sensors along the needle has no tracker."""
+    if not scenario.tracker.enabled and not controller.fuses:
+        raise InputError(
+            f"controller = {controller.name!r}: needs the tracker, and tracker.enabled = false: use 'adaptive-mpc'"
+        )
+
+
 def shorten_roll(setup: Setup, angle: Floats, roll: Floats) -> Floats:
     """Return the shortest rolls (rad) that turn bevels of needles at `angle` (rad) as `roll` does, within the range.
 

@@ -5,6 +5,7 @@ before, each by the needle's angle at its time, so that the quantity of the mode
 offset turns instead.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.estimation.moves import Move
-from flexneedle.scenario.sensors.sensor import Sensor, turn
-from flexneedle.types import Flags, Floats, Needles
+from flexneedle.scenario.sensors.sensor import Sensor, predict_values, turn
+from flexneedle.types import Flags, Floats, Needles, Reading
 
 DOUBT = 2.0
 """Factor on the model's error where readings are compared with their predictions."""
@@ -105,17 +106,25 @@ class Comparison:
             return np.nan
         mean = np.nansum(kept, axis=0)[seen] / count[seen]
         covariance = self.covariance[np.ix_(seen, seen)] + np.diag(self.noise**2 / count[seen])
-        return float(mean @ np.linalg.solve(covariance, mean)) / mean.size
+        square: float = mean @ np.linalg.solve(covariance, mean)
+        return square / int(mean.size)
+
+
+def without_prediction(readings: Sequence[Reading]) -> Comparison:
+    """Return readings (r,) that are compared with nothing, of an estimate that does not predict them."""
+    known = [any(math.isfinite(value) for row in one.rows for value in row) for one in readings]
+    value = np.where(known, 0.0, np.nan)[:, None]
+    return Comparison(value, np.full_like(value, np.nan), np.eye(1), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFit:
-    """A sensor in the fit, and its readings so far."""
+    """A sensor in the fit, and its readings until now."""
 
     sensor: Sensor
     slots: SensorSlots
     axes: int
-    model_sd: Floats  # model error (d,) of the mean of a move
+    size: int  # number of values d
     depths: Floats  # of the tip at the knots of the drift (k,), mm, behind the skin
     time: Floats  # (r,), s
     value: Floats  # (r, d), NaN where nothing was measured
@@ -177,7 +186,7 @@ class SensorFit:
         """
         flat = poses.reshape(-1, *poses.shape[-2:])
         needles = Needles(flat, length / (flat.shape[1] - 1))
-        found = self.sensor.predict(needles, self.axes)[:, :, None]
+        found = predict_values(self.sensor, needles, self.axes)[:, :, None]
         if self.sensor.place_sds:
             found = np.concatenate([found, self.sensor.slopes(needles, self.axes)], axis=2)
         return found.reshape(*poses.shape[:-2], *found.shape[1:])
@@ -204,7 +213,7 @@ class SensorFit:
     def bin_at(self, time: Floats, line: Timeline) -> Bins:
         """Return bins (b,) of one reading each, at times (b,)."""
         index, part, angle = line.at(time)
-        none = np.zeros((len(time), len(self.model_sd)))
+        none = np.zeros((len(time), self.size))
         facing = np.exp(1j * angle) if self.sensor.rolls else np.ones(len(time), dtype=complex)
         return Bins(index, part, none, none, facing, time)
 
@@ -213,7 +222,7 @@ class SensorFit:
 
         It is 0 up to the skin, and changes by a step from knot to knot, linearly: a random walk.
         """
-        size = len(self.model_sd)
+        size = self.size
         width = self.axes if self.sensor.paired else 1
         begins = np.append(0.0, self.depths[:-1])
         ramps = np.clip((depth[:, None] - begins) / (self.depths - begins), 0.0, 1.0)
@@ -225,7 +234,7 @@ class SensorFit:
 
     def variances(self, bins: Bins) -> Floats:
         """Return the variances (b, d) of means, infinite where nothing was measured."""
-        noise = self.sensor.noise**2 / np.maximum(bins.count, 1.0) + self.model_sd**2
+        noise = self.sensor.noise**2 / np.maximum(bins.count, 1.0) + self.sensor.model_error(bins.value) ** 2
         return np.where(bins.count > 0.0, noise, np.inf)
 
     def expected(self, bins: Bins, ends: Floats, depth: Floats, parameters: Floats) -> Floats:
@@ -235,7 +244,7 @@ class SensorFit:
 
     def _errors(self, depth: Floats, parameters: Floats) -> Floats:
         """Return offset and drift (b, d), with the tip at depths (b,), mm."""
-        offset = np.broadcast_to(parameters[self.slots.offset], (len(depth), len(self.model_sd)))
+        offset = np.broadcast_to(parameters[self.slots.offset], (len(depth), self.size))
         if self.slots.drift.stop == self.slots.drift.start:
             return offset
         return offset + self._spread(depth) @ parameters[self.slots.drift]
@@ -247,7 +256,7 @@ class SensorFit:
     def _gains(self, parameters: Floats) -> Floats:
         """Return the gains (d,), or (1,) where their error is not estimated."""
         errors = parameters[self.slots.gain]
-        return 1.0 + (np.repeat(errors, len(self.model_sd) // errors.size) if errors.size else np.zeros(1))
+        return 1.0 + (np.repeat(errors, self.size // errors.size) if errors.size else np.zeros(1))
 
     def _with_gain(self, level: Floats, parameters: Floats) -> Floats:
         scaled = self._gains(parameters) * level

@@ -85,6 +85,11 @@ class Estimate(Protocol):
         ...
 
 
+def can_fuse(estimate: Estimate) -> bool:
+    """Return whether an estimate is corrected by sensors along the needle, too, as an `Identified` is."""
+    return hasattr(estimate, "compare")
+
+
 def describe_estimate(estimate: Estimate) -> str:
     """Return one line about an estimate, for its `repr`."""
     axes, tip = estimate.simulator.scenario.setup.axes, estimate.tip

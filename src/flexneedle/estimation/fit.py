@@ -44,7 +44,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     prior = fitted.prior
     jacobian, variance = jacobian_of(fitted), variance_of_rows(fitted)
     left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
-    whitening = Whitening.of(fitted, variance) if fitted.field_sd else None
+    whitening = Whitening.of(fitted, variance) if fitted.has_field else None
     if whitening:
         jacobian, left, variance = (
             whitening.of_rows(jacobian),
@@ -156,8 +156,11 @@ class Whitening(NamedTuple):
         path = np.cumsum(np.append(0.0, np.abs(fitted.rows[:, DB_X])))
         length = fitted.nominal.scenario.tracker.field_length_mm
         count, place = len(position.index), position.between(path) / length
-        correlated = np.exp(-np.abs(place[:, None] - place))
-        covariance = np.diag(variance[:count]) + fitted.field_sd**2 * correlated
+        since, sds = np.array(fitted.fields).T
+        begun = fitted.timeline.begun[position.index]
+        sd = sds[np.clip(np.searchsorted(since, begun, side="right") - 1, 0, None)]
+        correlated = np.multiply.outer(sd, sd) * np.exp(-np.abs(place[:, None] - place))
+        covariance = np.diag(variance[:count]) + correlated
         return Whitening(np.linalg.cholesky(covariance).astype(np.float64), variance)
 
     def of_rows(self, rows: Laterals) -> Laterals:
@@ -181,7 +184,7 @@ def inform_along(fitted: FittedInsertion) -> Iterator[Part]:
             gradient += rows.T @ left
             precision += rows.T @ rows
         seen = bins.count > 0.0
-        model = np.broadcast_to(one.model_sd**2, seen.shape)[seen]
+        model = one.sensor.model_error(bins.value)[seen] ** 2
         noise = one.sensor.noise**2 / bins.count[seen]
         yield Part(one.name, cost, int(seen.sum()), gradient, precision, kept_share(noise, model))
 
@@ -272,7 +275,7 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
 
 
 def _renew(curves: Floats, which: Sequence[int], slopes: Floats, depth: Floats, grid: Floats) -> Floats:
-    """Return curves (K, g, d) with those of some parameters from slopes (k, m, d) at depths (m,), which do not fall."""
+    """Return curves (K, g, d), renewed for some parameters by slopes (k, m, d) at depths (m,), which do not fall."""
     right = np.clip(np.searchsorted(depth, grid, side="right"), 1, depth.size - 1)
     width = depth[right] - depth[right - 1]
     part = np.clip((grid - depth[right - 1]) / np.where(width > 0.0, width, 1.0), 0.0, 1.0)[:, None]

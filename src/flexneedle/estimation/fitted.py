@@ -42,7 +42,7 @@ TRACKER = "tracker"
 
 
 class Part(NamedTuple):
-    """What a sensor adds to the cost of the fit, to its downhill gradient (K,), and to its second derivative (K, K)."""
+    """Share of a sensor in the cost of the fit, its downhill gradient (K,), and its second derivative (K, K)."""
 
     name: str
     cost: float
@@ -53,8 +53,10 @@ class Part(NamedTuple):
 
     def temper(self) -> "Part":
         """Return the part with the weight that it has with a lasting error of the model."""
-        cost, gradient, precision = (self.share * one for one in (self.cost, self.gradient, self.precision))
-        return self._replace(cost=cost, gradient=gradient, precision=precision)
+        share = self.share
+        return self._replace(
+            cost=share * self.cost, gradient=share * self.gradient, precision=share * self.precision
+        )
 
 
 def kept_share(noise: Floats, model: Floats) -> float:
@@ -99,7 +101,8 @@ class FittedInsertion:
     quantities: tuple[Floats, ...] = ()  # their values (m + 1, d, 1 + p) at the ends of the moves
     along_curves: tuple[Floats, ...] = ()  # derivatives (K, g, d) of their values over the depths
     parts: tuple[Part, ...] = ()  # of the last step of the fit, before it
-    field_sd: float = 0.0  # of the tracker's error that is correlated along the path (mm)
+    # standard deviations (mm) of the tracker's error that is correlated along the path, each from a time (s) on
+    fields: tuple[tuple[float, float], ...] = ()
 
     @property
     def axes(self) -> int:
@@ -164,6 +167,16 @@ class FittedInsertion:
         if self.slots.bias.stop:
             residuals[0] -= from_components(self.parameters[self.slots.bias])
         return residuals
+
+    @property
+    def field_sd(self) -> float:
+        """Present standard deviation (mm) of the tracker's error that is correlated along the path."""
+        return self.fields[-1][1] if self.fields else 0.0
+
+    @property
+    def has_field(self) -> bool:
+        """True if the tracker has, or had, an error that is correlated along the path."""
+        return any(sd for _, sd in self.fields)
 
     @cached_property
     def timeline(self) -> Timeline:

@@ -49,7 +49,7 @@ from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.simulator.state import State
+from flexneedle.scenario.sensors.sensor import read_values
 from flexneedle.types import (
     DB_X,
     PSI,
@@ -77,12 +77,14 @@ _RECENT = 12  # moves whose residuals are low-passed
 class Identification:
     """The observer of `adaptive-mpc`, whose settings it uses."""
 
+    fuses = True
+
     def begin(self, task: Task) -> "Identified":
         """Return the estimate before the first reading, the prior's means. Raises ScenarioError for too short cells."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         check_cells(scenario, settings)
         state, prior = simulator.start(task.plan.roll), Prior.of(scenario, settings, task.plan.target[0])
-        prior, slots, along = add_sensors(prior, task, state)
+        prior, slots, along = add_sensors(prior, task)
         step = scenario.setup.max_advance_mm
         grid = np.arange(
             scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (ROUND + 6) * step, step
@@ -107,8 +109,8 @@ class Identification:
             slots=slots,
             along=along,
             quantities=tuple(one.quantities(state.nodes[None], length) for one in along),
-            along_curves=tuple(np.zeros((prior.mean.size, grid.size, one.model_sd.size)) for one in along),
-            field_sd=scenario.tracker.field_sd_mm,
+            along_curves=tuple(np.zeros((prior.mean.size, grid.size, one.size)) for one in along),
+            fields=((0.0, scenario.tracker.field_sd_mm),),
         )
         return differentiate(start, simulate_due(start, prior.mean, range(prior.mean.size)))
 
@@ -222,7 +224,7 @@ class Identified(FittedInsertion):
         columns, prior = np.stack([np.ones_like(travel), travel, moves_on]), axial_errors_prior(scenario)
         if len(prior) > len(columns):
             columns = np.concatenate([columns, np.ones_like(travel)[None]])
-        if self.field_sd:
+        if self.has_field:
             field = Whitening.of(self, variance)
             without, columns = field.of_rows(without), field.of_rows(columns.T).T
             variance = np.ones_like(variance)
@@ -276,9 +278,13 @@ class Identified(FittedInsertion):
         y, z = components(self.parameters[self.slots.bias]) if self.slots.bias.stop else (0.0, 0.0)
         return self.axial_bias, y, z
 
+    def with_field(self, sd: float, since: float) -> "Identified":
+        """Return the estimate with another standard deviation (mm) of the field's error, from a time (s) on."""
+        return self if sd == self.field_sd else self.change(fields=(*self.fields, (since, sd)))
+
     def without_field(self, left: Laterals) -> Laterals:
         """Return residuals (r,) of the tip's position without the known part of the field's error."""
-        if self.field_sd == 0.0:
+        if not self.has_field:
             return left
         field = Whitening.of(self, self.variances()[0])
         lower = field.lower
@@ -298,7 +304,7 @@ class Identified(FittedInsertion):
         """Return the values (r, d) of readings."""
         length = self.nominal.scenario.needle.length_mm
         needle = Needles(self.state.nodes[None], length / (len(self.state.nodes) - 1))
-        return np.array([one.sensor.read(each, needle, self.axes) for each in readings])
+        return np.array([read_values(one.sensor, each, needle, self.axes) for each in readings])
 
     def without(self, name: str, since: float) -> "Identified":
         """Return the estimate fitted again without the readings of a sensor, or the `TRACKER`, from a time (s) on."""
@@ -317,7 +323,7 @@ class Identified(FittedInsertion):
         return fitted.change(residual=low_pass(self.settings, fitted.without_field(left)) if inside else 0.0)
 
     def conflict(self, name: str) -> float:
-        """Return the cost of the fit beyond those of a sensor alone and of all others alone, to second order.
+        """Return the cost of a fit to all less the costs of fits to a sensor and to the others, to second order.
 
         About 0 or below for sensors that agree.
         """
@@ -344,7 +350,7 @@ class Identified(FittedInsertion):
     def cost(self) -> float:
         """Negative logarithm of the posterior density, up to a constant."""
         variance = variance_of_rows(self)
-        return cost_of(self, variance, Whitening.of(self, variance) if self.field_sd else None)
+        return cost_of(self, variance, Whitening.of(self, variance) if self.has_field else None)
 
     def compare(self, name: str, readings: Sequence[Reading]) -> Comparison:
         """Return readings (r,) of a sensor along the needle beside their predictions."""
@@ -358,7 +364,7 @@ class Identified(FittedInsertion):
         jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)[0]
         known = (
             jacobian @ self.covariance @ jacobian.T
-            + np.diag((DOUBT * one.model_sd) ** 2)
+            + np.diag((DOUBT * one.sensor.model_error(predicted[-1:])[0]) ** 2)
             + one.sensor.wander_sd**2 * np.eye(len(jacobian))
         )
         return Comparison(values, values - predicted, known, one.sensor.noise)
@@ -451,13 +457,10 @@ class Identified(FittedInsertion):
         return float(scenario.tracker.jitter_per_axis**2 / count + unexplained**2)
 
 
-def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, tuple[SensorFit, ...]]:
-    """Return the prior with the errors of tracker and sensors, the places of all parameters, and the sensors.
-
-    state: at the start. The model's error of a sensor is that along the plan.
-    """
+def add_sensors(prior: Prior, task: Task) -> tuple[Prior, Slots, tuple[SensorFit, ...]]:
+    """Return the prior with the errors of tracker and sensors, the places of all parameters, and the sensors."""
     scenario = task.scenario
-    slots, axes, length = Slots.of(scenario), scenario.setup.axes, scenario.needle.length_mm
+    slots, axes = Slots.of(scenario), scenario.setup.axes
     own = prior.mean.size
     sds: list[float] = []
 
@@ -468,7 +471,6 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
 
     bias = add([scenario.tracker.bias_sd_mm] * axes) if scenario.tracker.bias_sd_mm else slots.bias
     along = []
-    shapes = planned_shapes(task, state) if scenario.sensor else np.zeros((0, 2, 5))
     for sensor in scenario.sensor:
         size, paired = sensor.size(axes), sensor.paired and axes == 2
         offset, grows = add([sensor.offset_sd] * size), _KNOTS if sensor.drift_sd else 0
@@ -480,13 +482,12 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
             add([sd]).start if sd else None
             for sd in (math.radians(sensor.turn_sd_deg) * paired, sensor.delay_sd_s)
         )
-        values = sensor.predict(Needles(shapes, length / (shapes.shape[1] - 1)), axes)
         along.append(
             SensorFit(
                 sensor,
                 SensorSlots(offset, drift, place, gain, turned, clock),
                 axes,
-                sensor.model_error(values),
+                size,
                 task.plan.target[0] / _KNOTS * np.arange(1.0, grows + 1.0),
                 np.zeros(0),
                 np.zeros((0, size)),
@@ -496,13 +497,6 @@ def add_sensors(prior: Prior, task: Task, state: State) -> tuple[Prior, Slots, t
     if not sds:
         return prior, slots, ()
     return prior.extend(sds), slots._replace(end=own, bias=bias), tuple(along)
-
-
-def planned_shapes(task: Task, state: State) -> Floats:
-    """Return the poses (m, n, 5) of the needle along the plan, of the scenario's model."""
-    rows = task.plan.controls[None]
-    shapes: Floats = task.simulator.rollout(state, rows, outputs=("shapes",), limits=False).shapes[0]
-    return shapes
 
 
 def low_pass(settings: Priors, left: Laterals) -> complex:

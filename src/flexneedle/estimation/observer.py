@@ -139,7 +139,8 @@ class Corrected:
     ) -> "Corrected":
         """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived.
 
-        With `control.essential_points` the newest points of sensors along the needle hold it, too.
+        With `control.essential_points` the newest points of sensors along the needle hold it, too, in the last move
+        with a reading.
         """
         used = drop_roll_readings(self.moves, measurements)
         moves = assign_readings(self.moves, used)
@@ -147,8 +148,9 @@ class Corrected:
         at = replace(self, state=self.past, moves=moves)
         past, closed, tips = at, 0, [at.tip]
         points = _newest_points(along) if self.simulator.scenario.control.essential_points else ()
+        last = max((k for k, done in enumerate(moves) if done.measurements), default=-1)
         for k, done in enumerate(moves):
-            at = _follow(at, done, points if k == len(moves) - 1 else ())
+            at = _follow(at, done, points if k == last else ())
             tips.append(at.tip)
             if closed == k and newest >= done.motion.ended - 1e-9:
                 past, closed = at, k + 1

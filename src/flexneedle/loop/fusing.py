@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.along import without_prediction
+from flexneedle.estimation.estimate import Estimate, can_fuse
 from flexneedle.estimation.fitted import TRACKER
+from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
@@ -20,7 +22,7 @@ from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, SensorState, Verdict, VerdictKind, X
 
 _STEPS = 12  # of the largest advance: readings of which are left out
-_CONFLICT = 20.0  # cost by which sensors contradict each other
+_CONFLICT = 6.0  # cost by which sensors contradict each other; healthy ones reach 5 in training worlds
 _SURE = 2.0  # times that cost: one of them is wrong
 _CLEAR, _CLEARER = 2.5, 1.6  # ratios of the misfits without another sensor and without the faulty one
 _LEAST_MISFIT = 0.05  # cost per value of a fit that is good in any case
@@ -78,7 +80,9 @@ def _read_sensor(
         return monitor, SensorState(sensor.title, verdict=monitor.excluded)
     depth = float(predicted.state.tip[X])
     monitor = monitor.add(readings, depth)
-    compared = predicted.compare(sensor.title, readings)
+    compared = (
+        predicted.compare(sensor.title, readings) if can_fuse(predicted) else without_prediction(readings)
+    )
     max_age = scenario.control.stale_after_s + now - begun + sensor.delay_s + 3.0 * sensor.delay_sd_s
     checked = check_readings(readings, compared, now, max_age)
     good = np.array([one.verdict.ok for one in checked])
@@ -86,6 +90,7 @@ def _read_sensor(
     # Where most are outliers, they are no chance: the sensor is faulty, or the prediction is wrong.
     judged = good | outlying if outlying.sum() > _OUTLYING * (good | outlying).sum() else good
     nis = compared.nis(judged) if judged.any() else math.nan
+    monitor = monitor.innovate(nis)
     if monitor.excluded.ok:
         frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
         monitor = replace(monitor, excluded=frozen)
@@ -105,7 +110,10 @@ def exclude_faulty(
             return estimate.without(one.name, since), watch, tuple(states), OK
     active = [name for name in (TRACKER, *(one.name for one in states)) if watch.of(name).excluded.ok]
     conflicts = {name: estimate.conflict(name) for name in active}
-    faulty, verdict = judge_conflict(conflicts, {name: estimate.misfit(name) for name in active})
+    surprised = any(watch.of(name).surprised for name in active)
+    faulty, verdict = judge_conflict(
+        conflicts, {name: estimate.misfit(name) for name in active}, surprised=surprised
+    )
     if not faulty:
         return estimate, watch, tuple(states), verdict
     watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
@@ -115,21 +123,28 @@ def exclude_faulty(
     return estimate.without(faulty, since), watch, after, OK
 
 
-def judge_conflict(conflicts: Mapping[str, float], misfits: Mapping[str, float]) -> tuple[str, Verdict]:
+def judge_conflict(
+    conflicts: Mapping[str, float], misfits: Mapping[str, float], *, surprised: bool = False
+) -> tuple[str, Verdict]:
     """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
     Sensors that contradict each other cost the fit to all more than fits to each alone. What is left without the faulty
-    one agrees with the model, and what is left without another does not. While this is not clear the insertion goes on,
-    but not up to twice the limit of the cost. conflicts, misfits: of the sensors by name, as of an `Identified`.
+    one agrees with the model, and what is left without another does not. While this is not clear the insertion
+    continues, but not up to twice the limit of the cost.
+
+    conflicts, misfits: of the sensors by name, as of an `Identified`; surprised: True if readings are far from their
+    predictions, since a sensor may contradict itself, too.
     """
     most = max(conflicts.values(), default=0.0)
-    if most <= _CONFLICT:
+    if most <= _CONFLICT and not surprised:
         return "", OK
     first, *others = sorted(misfits, key=lambda name: misfits[name])
     ratio = min((misfits[name] for name in others), default=math.inf) / max(misfits[first], _LEAST_MISFIT)
     sure = most > _SURE * _CONFLICT
-    if ratio > (_CLEARER if sure else _CLEAR) or first == TRACKER:
-        reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:g}"
+    if ratio > (_CLEARER if sure else _CLEAR) or (first == TRACKER and most > _CONFLICT):
+        reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:.0f}"
+        if most <= _CONFLICT:
+            reason = f"without it the fit is {ratio:.1f} times better than without another"
         return first, Verdict(
             VerdictKind.CONTRADICTED, f"{TRACKER}: {reason}" if first == TRACKER else reason
         )
@@ -144,6 +159,16 @@ def _time_of_depth(estimate: Any, scenario: Scenario) -> float:
     depth = float(estimate.tips[-1, X]) - _STEPS * scenario.setup.max_advance_mm
     k = int(np.searchsorted(np.maximum.accumulate(estimate.tips[1:, X]), depth))
     return float(estimate.moves[min(k, len(estimate.moves) - 1)].motion.begun)
+
+
+def set_field(scenario: Scenario, estimate: Any, monitor: Monitor, since: float) -> Any:
+    """Return the estimate with the error of the tracker's field that the references show, from a time (s) on.
+
+    In a clean field it is the scenario's.
+    """
+    settings, largest, least = scenario.monitor, monitor.largest_indicator(), scenario.tracker.field_sd_mm
+    sd = settings.error_per_indicator_mm * largest / math.sqrt(3.0)
+    return estimate.with_field(max(least, sd) if largest > settings.indicator_limit else least, since)
 
 
 def check_uncertain(

@@ -10,7 +10,7 @@ from flexneedle.arguments import check_instance
 from flexneedle.control import controller_tables
 from flexneedle.control.controllers import DEFAULT, with_controller_defaults
 from flexneedle.control.interface import Controller
-from flexneedle.control.limits import check_guide
+from flexneedle.control.limits import check_guide, check_tracker
 from flexneedle.errors import TO_INSERT_ANYWAY, RunError
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.closed_loop import run
@@ -61,7 +61,7 @@ def insert(
 
     Raises:
         InputError: For an unknown name, an unsuitable object, a plan for another scenario, or a controller without
-            the movable guide that it needs.
+            the movable guide or the tracker that it needs.
         RigError: For a rig that breaks a rule or does not fit the scenario.
         DriverError: If a device cannot be opened, or stopped after another error.
         StoppedError: If the insertion is stopped before the first motion.
@@ -80,8 +80,9 @@ def insert(
 
 
 def check_choices(scenario: Scenario, strategy: str, choices: Choices) -> None:
-    """Raise InputError for a controller whose guide may not move, RigError for a rig that does not fit."""
+    """Raise InputError for a controller whose guide may not move or without a tracker, RigError for an unfit rig."""
     check_guide(choices.controller, scenario.setup, strategy)
+    check_tracker(choices.controller, scenario)
     choices.rig.check(scenario, strategy)
 
 

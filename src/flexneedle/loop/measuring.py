@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.estimate import Estimate, can_fuse
 from flexneedle.estimation.fitted import TRACKER
 from flexneedle.loop.fusing import (
     NO_WATCH,
@@ -12,6 +12,7 @@ from flexneedle.loop.fusing import (
     check_uncertain,
     exclude_faulty,
     read_sensors,
+    set_field,
 )
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
@@ -43,12 +44,17 @@ class Observation:
     def has_good_reading_after(self, time: float) -> bool:
         """Return whether a good reading was taken after `time` (s)."""
         tip = any(one.verdict.ok and one.measurement.time > time - 1e-6 for one in self.readings)
-        return tip or any(one.time > time - 1e-6 for state in self.sensors for one in state.good)
+        return tip or any(taken > time - 1e-6 for taken in self._sensor_times)
 
     @property
     def newest(self) -> float:
         """Time (s) of the newest good reading of any sensor, the period's measurement's without others."""
-        return max([self.measurement.time, *(one.time for state in self.sensors for one in state.good)])
+        return max([self.measurement.time, *self._sensor_times])
+
+    @property
+    def _sensor_times(self) -> list[float]:
+        """Times (s) of the good readings of sensors along the needle, if they correct the estimate."""
+        return [one.time for state in self.sensors for one in state.good] if can_fuse(self.estimate) else []
 
     def hold_limit(self, scenario: Scenario) -> float:
         """Return the longest hold (s) for the verdict of this period."""
@@ -87,10 +93,16 @@ def observe_all(
     """Observe with all sensors: as `observe`, and by the sensors along the needle, if there are any.
 
     Then the needle is held if the tip is not known well enough, and not because the tracker alone does not measure it.
+    For an estimate that does not fuse them, sensors along the needle are recorded only (`control.essential_points` uses
+    them), and the needle is held as without them.
     """
     if not scenario.sensor:
         return observe(scenario, predicted, before.monitor, begun, now, rig.tracker)
     watch, sensors = read_sensors(scenario, predicted, before.watch, begun, now, rig.sensors)
+    if not can_fuse(predicted):
+        used = sensors if scenario.control.essential_points else ()
+        found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, used)
+        return replace(found, watch=watch, sensors=sensors)
     trusted = watch.of(TRACKER).excluded.ok
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
     estimate, watch, sensors, verdict = exclude_faulty(scenario, found.estimate, watch, sensors, before.watch)
@@ -129,12 +141,15 @@ def observe(
     monitor, readings = _check_readings(scenario, predicted, monitor, measurements, max_ages, now)
     newest = readings[-1]
     monitor, field = monitor.check_field()
-    if not field.ok:
+    fused = bool(sensors) and can_fuse(predicted) and scenario.monitor.error_per_indicator_mm > 0.0
+    if fused:
+        predicted = set_field(scenario, predicted, monitor, begun)
+    if not (field.ok or (fused and field.kind is VerdictKind.FIELD_DISTORTED)):
         rejected = _reject_readings(readings, field)
         return Observation(
             correct(()).without_reading(), monitor, rejected, newest.measurement, field, field=True
         )
-    if not (doubt := monitor.field_in_doubt()).ok:
+    if not (doubt := monitor.field_in_doubt()).ok and not fused:
         readings = _reject_readings(readings, doubt)
     good = [reading.measurement for reading in readings if reading.verdict.ok]
     corrected = correct(good)

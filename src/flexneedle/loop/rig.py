@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flexneedle.arguments import make_refusal
+from flexneedle.errors import RigError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.events import Stream
 from flexneedle.phantom.phantom import Condition
@@ -86,6 +87,12 @@ class Rig(RigSource):
             )
         if not (self.deadline is None or 0.0 < self.deadline < math.inf):
             raise make_refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
+
+    def check(self, scenario: Scenario, strategy: str) -> None:
+        """Raise RigError unless the rig has each of the scenario's sensors along the needle."""
+        del strategy
+        if missing := [one.title for one in scenario.sensor if one.title not in self.sensors]:
+            raise RigError(f"sensors = {', '.join(self.sensors) or 'none'}: lacks {', '.join(missing)}")
 
     def open(
         self, scenario: Scenario, plan: Plan, seed: int, stream: Stream

@@ -131,8 +131,11 @@ def _bias(scenario: Scenario, angle: float, rng: np.random.Generator) -> Point:
 
 
 def _drift(scenario: Scenario, rng: np.random.Generator) -> Point:
-    """Draw the tracker's growing error (mm), across the needle."""
-    size, angle = scenario.phantom.tracker_drift_mm, float(rng.uniform(0.0, 2.0 * math.pi))
+    """Draw the tracker's growing error (mm), across the needle; nothing is drawn without one."""
+    size = scenario.phantom.tracker_drift_mm
+    if size == 0.0:
+        return 0.0, 0.0, 0.0
+    angle = float(rng.uniform(0.0, 2.0 * math.pi))
     if scenario.setup.axes == 1:
         return 0.0, math.copysign(size, math.cos(angle)), 0.0
     return 0.0, size * math.cos(angle), size * math.sin(angle)

@@ -18,6 +18,7 @@ from flexneedle.scenario.rules import (
     layer_problems,
     monitor_problems,
     plan_problems,
+    sensor_problems,
     target_problems,
     zone_problems,
 )
@@ -91,6 +92,7 @@ class Scenario(Section):
                 zone_problems(self.zone, self.zones, self.guard),
                 plan_problems(self.plan),
                 monitor_problems(self.monitor, self.tracker),
+                sensor_problems(self.sensor, self.tracker, self.needle, self.setup, self.target),
                 grid_problems(self.setup, self.contact, self.phantom, self.tracker),
             )
         )
@@ -131,6 +133,10 @@ class Scenario(Section):
         values, changes = self.values(), {spell(key): value for key, value in changes.items()}
         for key, value in (changes | dict.fromkeys(find_replaced(changes))).items():
             set_value(values, key, _expand_environment(key, value))
+        for name in _LISTS:  # of keys such as sensor.0.kind, where there was none
+            tables = values.get(name)
+            if isinstance(tables, dict) and tables.keys() == {*range(len(tables))}:
+                values[name] = [tables[number] for number in range(len(tables))]
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:

@@ -8,6 +8,8 @@ from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import key_path
 from flexneedle.scenario.sections.zones import ImageSettings, ZoneFile
+from flexneedle.scenario.sensors.points import Points
+from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.scenario.zone_files import find_lost
 
 
@@ -106,6 +108,7 @@ def find_doubts(scenario: Scenario) -> list[str]:
         *_unusual(scenario),
         *_find_unused(scenario),
         *_stale(scenario),
+        *_find_idle_sensors(scenario),
         *find_unplaced(scenario),
         *find_lost(scenario).values(),
     ]
@@ -142,6 +145,22 @@ def _stale(scenario: Scenario) -> Iterator[str]:
         rule = f"readings arrive {_short(age)} s old, above control.stale_after_s ({limit:g}), and hold the needle"
         remedy = "lower it, or raise control.stale_after_s"
         yield f"phantom.delay_periods = {periods:g}: {rule}: {remedy} (setup.insertion_speed_mm_s is low)"
+
+
+def _find_idle_sensors(scenario: Scenario) -> Iterator[str]:
+    """Yield a line for each sensor along the needle or setting of theirs without effect, and for an unknown depth."""
+    for k, sensor in enumerate(scenario.sensor):
+        starts = {"plane_mm": getattr(sensor, "plane_mm", None), "from_mm": getattr(sensor, "from_mm", None)}
+        for key, value in starts.items():
+            if value is not None and value >= scenario.target.depth_mm:
+                rule = f"beyond target.depth_mm ({scenario.target.depth_mm:g}): the sensor measures nothing"
+                yield f"sensor[{k}].{key} = {value:g}: {rule}"
+    control = scenario.control
+    if control.essential_points and not any(isinstance(one, Slice | Points) for one in scenario.sensor):
+        yield 'control.essential_points = true: has no effect without a [[sensor]] "points" or "slice"'
+    if not scenario.tracker.enabled and control.start_axial_sd_mm:
+        rule = "without a tracker this error of the depth remains: home the tip, and set it to what is left"
+        yield f"control.start_axial_sd_mm = {control.start_axial_sd_mm:g}: {rule}"
 
 
 def find_unplaced(scenario: Scenario) -> Iterator[str]:

@@ -9,12 +9,18 @@ from flexneedle.scenario.sections.monitor import GuardSettings, MonitorSettings
 from flexneedle.scenario.sections.needle import Bevel, Needle
 from flexneedle.scenario.sections.settings import PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.zones import Zone, ZoneFile, ZoneSettings
+from flexneedle.scenario.sensors.fbg import Fbg
+from flexneedle.scenario.sensors.kinds import broken_rule
+from flexneedle.scenario.sensors.points import Range
+from flexneedle.scenario.sensors.sensor import Sensor
+from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.scenario.tissue.layer import Contact, Layer
 
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
 _HALF_TURN_DEG = 180.0
 _FRAMES_IN_A_WINDOW = 2
+_TRACKER = "tracker"  # its name among the sensors
 _ROUNDING_MM = 1e-9  # of an entry that a plan has chosen
 
 
@@ -180,3 +186,41 @@ def monitor_problems(monitor: MonitorSettings, tracker: TrackerSettings) -> Iter
     if judged and monitor.indicator_window_s < least:
         rule = f"must be at least {least:g}, {_FRAMES_IN_A_WINDOW} frames at tracker.rate_hz ({tracker.rate_hz:g})"
         yield Problem("monitor.indicator_window_s", monitor.indicator_window_s, rule)
+
+
+def sensor_problems(
+    sensors: Sequence[Sensor], tracker: TrackerSettings, needle: Needle, setup: Setup, target: Target
+) -> Iterator[Problem]:
+    """Yield broken rules of sensors along the needle: names, kinds of a user, and places that no needle reaches."""
+    if not tracker.enabled and not sensors:
+        yield Problem(
+            "tracker.enabled", False, "nothing measures the needle: must be true without a [[sensor]]"
+        )
+    names = [sensor.title for sensor in sensors]
+    for i, (sensor, name) in enumerate(zip(sensors, names, strict=True)):
+        at = f"sensor.{i}"
+        if name in names[:i] or name == _TRACKER:
+            other = "the tracker" if name == _TRACKER else f"sensor[{names.index(name)}]"
+            yield Problem(f"{at}.name", name, f"must differ from the name of {other}")
+        if rule := broken_rule(sensor, setup.axes, needle.length_mm, target.depth_mm):
+            yield Problem(f"{at}.kind", sensor.kind, rule)
+        fastest = _MOST_READINGS_A_STEP / setup.step_time
+        if sensor.rate_hz > fastest:
+            rule = f"must be at most {fastest:g}, {_MOST_READINGS_A_STEP} readings in a control step"
+            yield Problem(f"{at}.rate_hz", sensor.rate_hz, rule)
+        yield from _place_problems(at, sensor, needle, setup)
+
+
+def _place_problems(at: str, sensor: Sensor, needle: Needle, setup: Setup) -> Iterator[Problem]:
+    """Yield sites beyond the needle, and images that the tip never reaches."""
+    reach = f"the tip goes to {setup.max_depth:g} (setup.stroke_mm - setup.tip_to_skin_mm)"
+    if isinstance(sensor, Fbg) and sensor.sites_mm[-1] + 0.5 * sensor.gauge_mm > needle.length_mm:
+        rule = f"the last gauge must end at most {needle.length_mm:g} from the tip, at needle.length_mm"
+        yield Problem(f"{at}.sites_mm", sensor.sites_mm[-1], rule)
+    if isinstance(sensor, Slice) and sensor.plane_mm >= setup.max_depth:
+        yield Problem(f"{at}.plane_mm", sensor.plane_mm, f"is never crossed: {reach}")
+    if isinstance(sensor, Slice) and sensor.plane_mm <= (base := setup.start_tip_x - needle.length_mm):
+        rule = f"is never crossed: the base starts at {base:g} (setup.tip_to_skin_mm, needle.length_mm)"
+        yield Problem(f"{at}.plane_mm", sensor.plane_mm, rule)
+    if isinstance(sensor, Range) and sensor.from_mm >= setup.max_depth:
+        yield Problem(f"{at}.from_mm", sensor.from_mm, f"no needle is there: {reach}")

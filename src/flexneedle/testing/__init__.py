@@ -14,6 +14,7 @@ from flexneedle.testing.driver import DriverConformance
 from flexneedle.testing.motors_kit import MotorsConformance
 from flexneedle.testing.needle_sensor import NeedleSensorConformance
 from flexneedle.testing.plant import PlantConformance
+from flexneedle.testing.sensor import SensorConformance
 from flexneedle.testing.tip_tracker import TipTrackerConformance
 from flexneedle.testing.tracker_kit import TrackerConformance
 
@@ -23,6 +24,7 @@ __all__ = [
     "MotorsConformance",
     "NeedleSensorConformance",
     "PlantConformance",
+    "SensorConformance",
     "TipTrackerConformance",
     "TrackerConformance",
 ]

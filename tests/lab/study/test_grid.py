@@ -268,6 +268,7 @@ def test_the_shipped_studies_load():
         "guide-distance": 7 * 150,
         "gauges": 8 * 150,
         "tracker": 5 * 150,
+        "sensors": 11 * 30,
         "wide": 1425,
         "worlds": 2202,
         "space": 3 * 4 * 150,
@@ -343,7 +344,8 @@ def test_each_imperfection_is_changed_alone():
         "rotation_friction_mn",
     )
     none_in_the_plane = {f"phantom.{name}" for name in out_of_plane}
-    assert own - set(changed) == {*sizes, *none_in_the_plane, "phantom.structure"}
+    faults = {f"phantom.tracker_{name}_mm" for name in ("drift", "lost")}
+    assert own - set(changed) == {*sizes, *none_in_the_plane, *faults, "phantom.structure"}
     assert changed.pop("phantom.tracker_bias_mm") == (0.0, 0.3)
     assert changed.pop("phantom.shear_modulus_factor") == ([0.6, 1.6], [0.3, 2.5])
     assert changed.pop("phantom.bevel_factor") == ([0.5, 1.5], [0.0, 2.0])

@@ -29,10 +29,10 @@ from flexneedle.types import THETA, Floats, Needles, Reading, X, Y
 _LASTING_MM = 20.0
 _START = (5.0, 0.1)  # standard deviations (mm, rad) of the unknown start, as of the tip (deviations.py)
 _SHIFT_MM, _TILT = 0.1, 1e-3  # steps of differences
-_FACTORS = ((math.log(0.3), math.log(30.0)), (math.log(3.0), math.log(100.0)))
+_FACTORS = ((0.0, math.log(30.0)), (math.log(2.0), math.log(100.0)))
 """Bounds of the factors on noise and model error. The identification fits base, bend and the modulus along the depth,
 too; without these the exact rod's curvature is up to 12 % off the model's (studies/calibration_sensors.py)."""
-FIRST_FACTORS = np.array([1.0, 3.0])
+FIRST_FACTORS = np.array([1.0, 2.0])
 """Factors at the start of a fit."""
 _AT_REST = Timeline.of((), 0.0)
 _LEAST_SD = 1e-9  # of an offset that is known
@@ -60,7 +60,7 @@ def lay_out(sensors: Sequence[Sensor], axes: int, begin: int) -> tuple[tuple[Sen
             clock=None,
         )
         none = np.zeros(0), np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
-        found.append(SensorFit(sensor, slots, axes, np.zeros(size), *none))
+        found.append(SensorFit(sensor, slots, axes, size, *none))
     return tuple(found), sds
 
 
@@ -81,7 +81,7 @@ def read_means(
     """
     for fit in sensors:
         readings = [each for each in one.readings if each.sensor == fit.name]
-        total, count = np.zeros((2, len(one.depth), len(fit.model_sd)))
+        total, count = np.zeros((2, len(one.depth), fit.size))
         for each in readings:
             needle = Needles(shapes[each.step][None], length / (shapes.shape[1] - 1))
             try:
@@ -121,7 +121,7 @@ def residuals_along(
     at_ends = np.concatenate([ends[0, :1], ends[0]])
     at = replace(bins, index=np.arange(len(depth)))
     value = bins.value - fit.expected(at, at_ends, depth, point)
-    slopes = np.zeros((len(depth), len(point), len(fit.model_sd)))
+    slopes = np.zeros((len(depth), len(point), fit.size))
     for k, step in enumerate(steps.tolist()[: len(ends) - 1]):
         slopes[:, k] = (ends[1 + k, ..., 0] - ends[0, ..., 0]) / step
     jacobian = fit.jacobian(at, at_ends, depth, slopes, point, _AT_REST)
@@ -167,7 +167,7 @@ def path_along(
     planned = sensor.predict(Needles(at, length / (at.shape[1] - 1)), fit.axes)
     depth = np.repeat(one.depth[bins.index], known.sum(axis=1))
     apart, value = np.abs(depth[:, None] - depth), np.nonzero(known)[1]
-    size = np.broadcast_to(sensor.model_error(planned), known.shape)[known]
+    size = sensor.model_error(planned)[known]
     same = value[:, None] == value
     model = np.outer(size, size) * np.exp(-apart / _LASTING_MM) * same
     offsets = found.slopes[:, fit.slots.offset]

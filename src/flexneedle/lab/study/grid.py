@@ -17,7 +17,7 @@ from flexneedle.control.controllers import (
     find_own_controllers,
 )
 from flexneedle.control.interface import Controller
-from flexneedle.control.limits import check_guide
+from flexneedle.control.limits import check_guide, check_tracker
 from flexneedle.errors import InputError, ScenarioError, make_printable
 from flexneedle.lab.study.spec import (
     ALL,
@@ -68,7 +68,7 @@ _CHOICES = {
 }
 _DEFAULT_TARGET: dict[str, Any] = dict(zip(TARGET_KEYS, Target().position, strict=True))
 _OWN = {"controller": find_controller, "plant": find_plant, "tracker": find_tracker}
-_CUSTOM = {*_OWN, "law", "term"}
+_CUSTOM = {*_OWN, "law", "term", "kind"}
 """Keys, and last parts of keys, that name a custom part."""
 _MAX_INSERTIONS = 1_000_000
 _KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG, WORLD_KIND))
@@ -238,7 +238,7 @@ def _collect_values(key: str, settings: Mapping[str, Any]) -> list[Any]:
 
 
 def _find_custom_names(key: str, value: Any) -> Iterator[str]:
-    """Yield the names of all custom parts in the settings of a study: of runs, layers and cost terms."""
+    """Yield the names of all custom parts in the settings of a study: of runs, layers, cost terms and sensors."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             yield from _find_custom_names(name, inner)
@@ -349,7 +349,7 @@ def _make_point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario])
     at = make_printable(", ".join(f"{key} = {value}" for key, value in named.items()))
     start = parts.base if choice.world is None else worlds(choice.world, *kind.values())
     scenario = _vary(start, {**parts.left_out, **choice.settings}, parts.own, at)
-    _check_guide(choice.run, scenario, at)
+    _check_controller(choice.run, scenario, at)
     of_world: dict[str, Any] = {} if choice.world is None else {WORLD: choice.world, **kind}
     return StudyPoint(
         scenario,
@@ -370,9 +370,11 @@ def _is_skipped(scenario: Scenario, controller: str, kind: Mapping[str, str]) ->
     )
 
 
-def _check_guide(run: Mapping[str, Any], scenario: Scenario, at: str) -> None:
+def _check_controller(run: Mapping[str, Any], scenario: Scenario, at: str) -> None:
     try:
-        check_guide(find_controller(run["controller"])[1], scenario.setup, run["strategy"])
+        controller = find_controller(run["controller"])[1]
+        check_guide(controller, scenario.setup, run["strategy"])
+        check_tracker(controller, scenario)
     except InputError as error:
         raise InputError(f"{error}{_format_place(at)}") from None
 

@@ -189,6 +189,13 @@ class Monitor:
         window = settings.doubt_window_s
         return rules.check_in_doubt(_indicators(_within(frames, window)), settings.indicator_limit, window)
 
+    def largest_indicator(self) -> float:
+        """Return the largest median of the references' indicators over the shorter of the windows; 0 without any."""
+        frames = self._frames()
+        if not self.settings.enabled or not frames:
+            return 0.0
+        return rules.largest_median(_indicators(_within(frames, self.settings.doubt_window_s)))[1]
+
     def has_reading(self, now: float, max_age: float) -> bool:
         """Return whether the newest reading, good or bad, is at most `max_age` (s) old."""
         return bool(self.recent) and now - self.recent[-1].time <= max_age + 1e-9

@@ -144,7 +144,7 @@ def check_distortion(
     The verdict names the sensor with the largest median. resuming: true after a distorted field, with `limit` the lower
     one of the hysteresis.
     """
-    name, value = _largest_median(indicators)
+    name, value = largest_median(indicators)
     if value <= limit:
         return OK
     rule = "must fall below" if resuming else "limit"
@@ -157,14 +157,14 @@ def check_in_doubt(indicators: Mapping[str, Sequence[float]], limit: float, wind
 
     Readings of this time must not correct the estimate.
     """
-    name, value = _largest_median(indicators)
+    name, value = largest_median(indicators)
     if value <= limit:
         return OK
     reason = f"{name} {value:.4f}, limit {limit:.4f} (median over {window:g} s)"
     return Verdict(VerdictKind.FIELD_IN_DOUBT, reason)
 
 
-def _largest_median(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:
+def largest_median(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:
     """Return the sensor with the largest median indicator, and the median; ("", 0) if there is no indicator."""
     medians = {name: median(values) for name, values in indicators.items() if values}
     return max(medians.items(), key=lambda item: item[1], default=("", 0.0))

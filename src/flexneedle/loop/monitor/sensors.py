@@ -7,6 +7,7 @@ that contradicts the others is found by the fit (`flexneedle.loop.fusing`).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from flexneedle.types import OK, VISIBLE, CheckedReading, Floats, Reading, Verdi
 
 _OUTLIER_SDS = 6.0
 _REPEATS = 10
+_WINDOW = 8  # periods
+_SURPRISE = 2.0  # normalised square of the innovation
 
 
 @dataclass(frozen=True)
@@ -22,13 +25,23 @@ class SensorMonitor:
     """State of the monitor of one sensor. Frozen: each method returns the next state.
 
     newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them;
-    excluded: why the sensor does not count any more.
+    nis: normalised squares of the innovations of the last periods; excluded: why the sensor does not count any more.
     """
 
     newest: Reading | None = None
     repeats: int = 1
     since: float = 0.0
+    nis: tuple[float, ...] = ()
     excluded: Verdict = OK
+
+    def innovate(self, nis: float) -> "SensorMonitor":
+        """Return the state with the innovation of a period; NaN is none."""
+        return self if math.isnan(nis) else replace(self, nis=(*self.nis, nis)[-_WINDOW:])
+
+    @property
+    def surprised(self) -> bool:
+        """True if the last innovations are improbably large: their median, since the needle itself may leap."""
+        return len(self.nis) == _WINDOW and median(self.nis) > _SURPRISE
 
     def add(self, readings: Sequence[Reading], depth: float) -> "SensorMonitor":
         """Return the state with readings, with the tip at a depth (mm)."""
@@ -68,5 +81,5 @@ def _check(one: Reading, sds: Floats, now: float, max_age: float) -> Verdict:
     if abs(now - one.time) > max_age:
         return Verdict(VerdictKind.STALE, f"{now - one.time:.3f} s old, limit {max_age:.3f} s")
     if (most := float(np.abs(sds).max())) > _OUTLIER_SDS:
-        return Verdict(VerdictKind.OUTLIER, f"{most:.1f} standard deviations, limit {_OUTLIER_SDS:g}")
+        return Verdict(VerdictKind.OUTLIER, f"{most:.1f} standard deviations, limit {_OUTLIER_SDS:.1f}")
     return OK

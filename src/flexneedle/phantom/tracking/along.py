@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from flexneedle.scenario.sensors.sensor import Fault, Sensor, turn
+from flexneedle.scenario.sensors.sensor import Fault, Sensor, predict_values, turn
 from flexneedle.types import VISIBLE, Floats, Matrix, Needles, Point, Reading, X
 
 
@@ -122,7 +122,7 @@ class VirtualSensor:
         poses, roll = self._phantom.shape_at(time)
         needle = Needles(poses[None], self._length / (len(poses) - 1))
         seen = self._mounted.sees(needle, self._axes)[0]
-        level = self._gain * self._mounted.predict(needle, self._axes)
+        level = self._gain * predict_values(self._mounted, needle, self._axes)
         angle = self._turn - (roll if self._sensor.rolls else 0.0)
         if angle and self._sensor.paired:
             level = turn(level, np.exp(1j * angle), self._axes)

@@ -1,4 +1,4 @@
-"""Where the needle's curve passes given values of a coordinate: image planes, and points in space or in an image."""
+"""Crossings of the needle's curve with values of a coordinate: image planes, and points in space or in an image."""
 
 from typing import TYPE_CHECKING
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 def cross(along: "Floats", across: "Floats", stations: "Floats") -> "Floats":
     """Return coordinates (m, s, c) of curves where they pass stations (s,).
 
-    along (m, n): rising coordinate of the curves' points; across (m, n, c): the others. Beyond an end the curve goes on
-    straight.
+    along (m, n): rising coordinate of the curves' points; across (m, n, c): the others. Beyond an end the curve
+    continues straight.
     """
     last = along.shape[1] - 2
     left = np.clip((along[:, None, :] <= stations[:, None]).sum(axis=2) - 1, 0, last)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _PER_M = 1e-3
 _MODEL_PER_M = 0.01
 _STEP_MM = 1.0
-_MODEL_SHARE = 0.03  # of the curvature along the plan
+_MODEL_SHARE = 0.05  # of the curvature of a site
 
 
 class FbgErrors(SensorErrors):
@@ -30,6 +30,8 @@ class FbgErrors(SensorErrors):
 
 class Fbg(Sensor):
     """One `[[sensor]]` with `kind = "fbg"`."""
+
+    paired, rolls = True, True
 
     kind: Literal["fbg"]
     sites_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=1000)]
@@ -93,11 +95,6 @@ class Fbg(Sensor):
         """Prior standard deviations of the distances of the sites from the tip, mm."""
         return (self.site_sd_mm,) * len(self.sites_mm) if self.site_sd_mm else ()
 
-    @property
-    def rolls(self) -> bool:
-        """True: it rolls with the needle."""
-        return True
-
     def predict(self, needles: Needles, axes: int) -> "Floats":
         """Return the mean curvatures (m, d), 1/mm, over the gauges."""
         far = np.array(self.sites_mm) + 0.5 * self.gauge_mm
@@ -113,10 +110,13 @@ class Fbg(Sensor):
         change = (further.predict(needles, axes) - self.predict(needles, axes)) / _STEP_MM
         return change[:, :, None] * np.repeat(np.eye(len(self.sites_mm)), axes, axis=0)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,), 1/mm: a constant, and a share of the curvature along the plan."""
-        found: Floats = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * np.sqrt(np.mean(planned**2, axis=0)))
-        return found
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), 1/mm: a constant, and a share of the curvature of the site."""
+        count = len(self.sites_mm)
+        sites = values.reshape(len(values), count, values.shape[1] // count)
+        size = np.sqrt((sites**2).sum(axis=2, keepdims=True))
+        found = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * size)
+        return np.broadcast_to(found, sites.shape).reshape(values.shape)
 
     def mounted(self, rng: np.random.Generator) -> Self:
         """Return the sensor with its sites displaced."""

@@ -31,7 +31,7 @@ class PlaceErrors(SensorErrors):
 
 
 class Range(Sensor):
-    """A sensor that sees the needle from one x to another."""
+    """A sensor that measures the needle from one x to another."""
 
     from_mm: Coordinate = 0.0
     """x from which points are used."""
@@ -47,6 +47,8 @@ class Range(Sensor):
 
 class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
+
+    paired = True
 
     kind: Literal["points"]
     rate_hz: Positive = 2.0
@@ -94,9 +96,9 @@ class Points(Range):
         """Return which stations are between base and tip (m, d)."""
         return passed(needles.points[..., X], self.stations, axes)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,), mm."""
-        return np.full(planned.shape[1], _MODEL_MM)
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), mm."""
+        return np.full(values.shape, _MODEL_MM)
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
         """Return the lateral positions at the stations of points x, y, z (mm)."""

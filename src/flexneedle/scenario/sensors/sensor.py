@@ -1,20 +1,22 @@
 """A sensor along the needle: the common part of all kinds.
 
-A kind says what an error-free sensor measures on a needle, and how large the errors are. A reading is
+A kind predicts what an error-free sensor measures on a needle, and gives the sizes of the errors. A reading is
 
-    (1 + g) e^(i(ρ − φ)) (q + q' p) + o + w + ε
+    (1 + g) e^(i(ρ − φ)) (q + q' p) + o + d + w + ε
 
-with the quantity q of the needle, its derivative q' to the places p of the sensor, gain error g, turn ρ, offset o,
-wander w (correlated over time) and white noise ε; φ is the angle of the needle for a sensor that rolls with it, else 0.
-Units of values are those that the kind chooses, the same in all of its methods.
+with the quantity q of the needle (`predict`), its derivative q' (`slopes`) to the places p of the sensor, gain error g,
+turn ρ, offset o, drift d (which grows with the depth), wander w (correlated over time) and white noise ε; φ is the
+angle of the needle for a sensor that rolls with it, else 0. The kind chooses the unit of its values, the same in all
+methods.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
+from flexneedle.errors import DriverError
 from flexneedle.scenario.sections.fields import LARGEST, Fraction, NonNegative, Positive, Section, Title
 from flexneedle.types import Matrix, Needles, Reading
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
+
+_MODEL_NOISE = 0.3  # model error of a kind without its own, over its noise
 
 
 class Fault(Section):
@@ -56,15 +60,20 @@ class SensorErrors(Section):
 
 
 class Sensor(Section):
-    """One `[[sensor]]`. A kind is a subclass with its keys, `noise`, `size` and `predict`.
+    """One `[[sensor]]`. A kind is a subclass with its keys, `noise` and `predict`; all else has a default.
 
-    A value of a sensor is an array (d,). Where a needle in space has two lateral components, they follow each other.
+    A sensor has d values, `size`, in a unit that the kind chooses. `axes` is 1 for a needle in the plane, 2 in space.
     """
+
+    paired: ClassVar[bool] = False
+    """Whether values are lateral quantities: y in the plane, in space y and z, one after the other, as a vector."""
+    rolls: ClassVar[bool] = False
+    """Whether the sensor is in the needle and rolls with it. Its values are `paired`."""
 
     kind: str
     """`fbg`, `slice`, `points`, `view` or `module:NAME`."""
     name: Title | None = None
-    """Name in messages, tables and figures. Not set: the kind."""
+    """Name in messages, tables and figures. Not set: the kind, of `module:NAME` the NAME."""
     rate_hz: Positive = 20.0
     """Readings per second."""
     delay_s: NonNegative = 0.0
@@ -82,12 +91,35 @@ class Sensor(Section):
     @property
     def title(self) -> str:
         """Name in messages."""
-        return self.name or self.kind
+        return self.name or self.kind.rpartition(":")[2]
 
     @property
     def noise(self) -> float:
-        """Standard deviation of the white noise of a value."""
+        """Standard deviation of the white noise of a value, above 0."""
         raise NotImplementedError
+
+    def predict(self, needles: Needles, axes: int) -> "Floats":
+        """Return the values (m, d) of an error-free sensor on m needles, smooth functions of their poses.
+
+        They are finite on any needle, where the sensor does not see it (`sees`), too. For a sensor that rolls with the
+        needle, as if it did not.
+        """
+        raise NotImplementedError
+
+    def size(self, axes: int) -> int:
+        """Return the number of values d (default: 1, of a paired sensor `axes`)."""
+        return axes if self.paired else 1
+
+    def sees(self, needles: Needles, axes: int) -> "Flags":
+        """Return which values (m, d) the sensor can measure on needles (default: all)."""
+        return np.ones((len(needles.points), self.size(axes)), dtype=bool)
+
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d) of the model's error where these values (r, d) were measured.
+
+        It is the error of the mean of a move, which no parameter explains. Default: 0.3 times the noise.
+        """
+        return np.full(values.shape, _MODEL_NOISE * self.noise)
 
     @property
     def offset_sd(self) -> float:
@@ -114,45 +146,17 @@ class Sensor(Section):
         """Step of the values; 0: repeated values are the sign of a frozen sensor."""
         return 0.0
 
-    @property
-    def paired(self) -> bool:
-        """True if values in space are pairs of lateral components, y and z."""
-        return True
-
-    @property
-    def rolls(self) -> bool:
-        """True if the sensor is in the needle and rolls with it; its values are pairs."""
-        return False
-
-    def size(self, axes: int) -> int:
-        """Return the number of values d of a needle with 1 or 2 lateral axes."""
-        raise NotImplementedError
-
-    def predict(self, needles: Needles, axes: int) -> "Floats":
-        """Return the values (m, d) of an error-free sensor on needles, finite, beyond the tip, too.
-
-        For a sensor that rolls with the needle, as if it did not.
-        """
-        raise NotImplementedError
-
     def slopes(self, needles: Needles, axes: int) -> "Floats":
         """Return the derivatives (m, d, p) of the values to the places of the sensor."""
         return np.zeros((len(needles.poses), self.size(axes), 0))
 
-    def sees(self, needles: Needles, axes: int) -> "Flags":
-        """Return which values (m, d) the sensor can measure on needles (default: all)."""
-        return np.ones((len(needles.points), self.size(axes)), dtype=bool)
-
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (d,) of the model's error in the mean of a move; planned (m, d): along a plan."""
-        raise NotImplementedError
-
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":  # noqa: ARG002
         """Return the values (d,) of a reading, NaN where it has none; needle: as predicted at its time (m = 1).
 
-        Raises ValueError, with the rule, for rows of another shape.
+        Default: the numbers of all rows, of a paired sensor the first `axes` of each. Raises ValueError, with the rule,
+        for rows of another shape.
         """
-        return flatten(reading.rows, self.size(axes), axes)
+        return flatten(reading.rows, self.size(axes), axes if self.paired else None)
 
     def report(self, values: "Floats", axes: int) -> Matrix:
         """Return the rows of a reading with these values (d,): the inverse of `read`, for virtual sensors."""
@@ -172,16 +176,43 @@ class Sensor(Section):
         return rng.normal(0.0, self.offset_sd, self.size(axes))
 
 
-def flatten(rows: Matrix, size: int, axes: int) -> "Floats":
-    """Return the values (size,) of rows, of which the first `axes` numbers count; NaN without rows."""
+def flatten(rows: Matrix, size: int, width: int | None) -> "Floats":
+    """Return the values (size,) of rows, of which the first `width` numbers count (None: all); NaN without rows."""
     if not rows:
         return np.full(size, np.nan)
-    values: Floats = np.array(rows)[:, :axes].ravel()
+    values: Floats = np.array(rows)[:, :width].ravel()
     if values.size != size:
-        raise ValueError(
-            f"{len(rows)} rows of {len(rows[0])} numbers, expected {size // axes} rows of {axes}"
-        )
+        wanted = f"{size} numbers" if width is None else f"{size // width} rows of {width}"
+        raise ValueError(f"{len(rows)} rows of {len(rows[0])} numbers, expected {wanted}")
     return values
+
+
+def predict_values(sensor: Sensor, needles: Needles, axes: int) -> "Floats":
+    """Return the values (m, d) of an error-free sensor on needles.
+
+    Raises DriverError, with the sensor, for a kind whose values are of another shape or not finite.
+    """
+    values: Floats = np.asarray(sensor.predict(needles, axes), dtype=float)
+    if rule := values_rule(values, (len(needles.poses), sensor.size(axes))):
+        raise DriverError(f"sensor {sensor.title}: predict {rule}")
+    return values
+
+
+def values_rule(values: "Floats", shape: tuple[int, int]) -> str:
+    """Return the rule that predicted values break, or ""."""
+    if values.shape != shape:
+        return f"must return an array of the shape {shape}, needles by values, not {values.shape}"
+    if not np.isfinite(values).all():
+        return "must return finite numbers for every needle"
+    return ""
+
+
+def read_values(sensor: Sensor, reading: Reading, needle: Needles, axes: int) -> "Floats":
+    """Return the values (d,) of a reading. Raises DriverError, with the sensor, for rows that are not of its kind."""
+    try:
+        return sensor.read(reading, needle, axes)
+    except ValueError as error:
+        raise DriverError(f"sensor {sensor.title}: a reading has {error}") from error
 
 
 def turn(values: "Floats", facing: Any, axes: int) -> "Floats":

@@ -33,6 +33,8 @@ class PlaneErrors(SensorErrors):
 class Slice(Sensor):
     """One `[[sensor]]` with `kind = "slice"`."""
 
+    paired = True
+
     kind: Literal["slice"]
     plane_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
     """x at which the plane meets the insertion axis."""
@@ -67,10 +69,6 @@ class Slice(Sensor):
         """Standard deviation of the correlated noise, mm."""
         return self.wander_mm
 
-    def size(self, axes: int) -> int:
-        """Return the number of coordinates in the plane."""
-        return axes
-
     @property
     def frame(self) -> "Floats":
         """Rows (3, 3): normal, and the directions in the plane nearest to y and to z."""
@@ -95,9 +93,9 @@ class Slice(Sensor):
         """Return whether needles have passed the plane (m, axes)."""
         return passed(self._in_frame(needles.points)[0], np.zeros(1), axes)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (axes,), mm."""
-        return np.full(planned.shape[1], _MODEL_MM)
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), mm."""
+        return np.full(values.shape, _MODEL_MM)
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
         """Return the coordinates in the plane of x, y, z (mm)."""

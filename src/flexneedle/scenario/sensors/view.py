@@ -27,11 +27,13 @@ Row = Annotated[tuple[Entry, Entry, Entry, Entry], Field(strict=False)]
 class View(Range):
     """One `[[sensor]]` with `kind = "view"`.
 
-    Coordinates of a value are those across the insertion axis in the image; along it the image tells nothing.
+    A value is a coordinate across the insertion axis in the image; coordinates along it are not used.
     """
 
     kind: Literal["view"]
-    projection: Annotated[tuple[Row, Row, Row], Field(strict=False)]
+    projection: Annotated[
+        tuple[Row, Row, Row], Field(strict=False, json_schema_extra={"allowed": "3 lists of 4 numbers"})
+    ]
     """Matrix (3, 4): (column w, row w, w) in pixels = projection · (x, y, z, 1) in mm."""
     rate_hz: Positive = 10.0
     """Images per second."""
@@ -95,11 +97,6 @@ class View(Range):
         return np.linspace(0.0, self._axis[2], _STATIONS)
 
     @property
-    def paired(self) -> bool:
-        """False: a value is a number across the axis."""
-        return False
-
-    @property
     def noise(self) -> float:
         """Standard deviation of the white noise, pixels."""
         return self.noise_px
@@ -130,9 +127,9 @@ class View(Range):
         del axes
         return passed(self._in_image(self._pixels(needles.points))[0], self.stations, 1)
 
-    def model_error(self, planned: "Floats") -> "Floats":
-        """Return standard deviations (s,), pixels."""
-        return np.full(planned.shape[1], _MODEL_MM * self._axis[2] / (self.to_mm - self.from_mm))
+    def model_error(self, values: "Floats") -> "Floats":
+        """Return standard deviations (r, d), pixels."""
+        return np.full(values.shape, _MODEL_MM * self._axis[2] / (self.to_mm - self.from_mm))
 
     def read(self, reading: Reading, needle: Needles, axes: int) -> "Floats":
         """Return the pixels across the axis at the stations of points in the image."""

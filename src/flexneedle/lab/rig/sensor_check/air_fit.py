@@ -20,7 +20,7 @@ from flexneedle.estimation.prior import LEAST_SD, Priors
 from flexneedle.lab.rig.sensor_check.air_run import AirRun
 from flexneedle.mechanics.model import adapt_needle
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sensors.sensor import Sensor
+from flexneedle.scenario.sensors.sensor import Sensor, read_values
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL, Flags, Floats, Needles, X, Y, Z
 
@@ -97,7 +97,7 @@ class AirModel:
             sds += more
             size = sensor.size(axes)
             none = np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
-            sensors.append(SensorFit(sensor, sensor_slots, axes, np.zeros(size), np.zeros(0), *none))
+            sensors.append(SensorFit(sensor, sensor_slots, axes, size, np.zeros(0), *none))
         line = Timeline.of(run.moves, 0.0)
         tips = np.array([(one.time, one.x, one.y, one.z or 0.0) for one in run.measurements]).reshape(-1, 4)
         tips = tips[~rolling(line, tips[:, 0])]
@@ -125,7 +125,8 @@ class AirModel:
         spacing = self.length / (shapes.shape[1] - 1)
         needles = (Needles(shapes[k + 1][None], spacing) for k in index)
         values = [
-            one.sensor.read(each, needle, one.axes) for each, needle in zip(given, needles, strict=True)
+            read_values(one.sensor, each, needle, one.axes)
+            for each, needle in zip(given, needles, strict=True)
         ]
         value = np.array(values).reshape(-1, one.value.shape[1])
         if one.sensor.rolls and one.axes == 1:  # between half turns it leaves the plane
@@ -227,7 +228,7 @@ class AirFit:
     def offset(self, number: int) -> list[tuple[float, float]]:
         """Return the offsets (d,) of a sensor, and their standard deviations, with the error of the model."""
         one = self.model.sensors[number]
-        unexplained = one.sensor.model_error(self.predicted[number])
+        unexplained = one.sensor.model_error(self.predicted[number]).mean(axis=0)
         places = range(one.slots.offset.start, one.slots.offset.stop)
         return [
             (value, math.hypot(sd, more))

@@ -1,0 +1,171 @@
+"""Sensors along the needle in the fit: derivatives by finite differences, and linear problems with known answers."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.estimation.along import between, whiten
+from flexneedle.estimation.fit import differentiate, simulate_due
+from flexneedle.estimation.fitted import TRACKER, Part
+from flexneedle.estimation.identification import Identification
+from flexneedle.loop.virtual import Seeds, virtual_rig
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Control
+from tasks import begun_with
+
+FBG = {"kind": "fbg", "sites_mm": [11, 26, 70, 105], "delay_sd_s": 0.05}
+SLICE = {"kind": "slice", "plane_mm": 12.0, "normal": [1.0, 0.2, -0.1], "delay_sd_s": 0.05}
+POINTS = {"kind": "points", "from_mm": -15.0, "to_mm": 30.0, "rate_hz": 10.0}
+ROLLS = {14: 0.7, 34: -1.9}
+
+
+def command(k):
+    """An advance with a moving guide, and rolls by odd angles."""
+    return Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), dg_z=0.08 * np.cos(0.2 * k), roll=ROLLS.get(k, 0.0))
+
+
+@cache
+def followed(axes=2, count=50, **changes):
+    """An estimate that has followed a virtual needle with three sensors besides the tracker, and the rig."""
+    name = {1: "phantom", 2: "phantom3d"}[axes]
+    scenario = flexneedle.load_scenario(name).with_values({"sensor": [FBG, SLICE, POINTS], **changes})
+    rig = virtual_rig(scenario, 0.0, Seeds.of(2))
+    estimate = Identification().begin(begun_with(Simulator(scenario, threads=1)))
+    for k in range(count):
+        row = command(k) if axes == 2 else Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), flip=k in ROLLS)
+        estimate = estimate.move(rig.driver.apply(row, 0.2))
+        along = {name: one.read() for name, one in rig.sensors.items()}
+        good = {name: [one for one in readings if one.rows] for name, readings in along.items()}
+        estimate = estimate.observe([one for one in rig.tracker.read() if one.x is not None], good)
+    return estimate, rig
+
+
+def expected(estimate, number):
+    """Predicted means of a sensor with the present parameters."""
+    one, bins = estimate.along[number], estimate.bins[number]
+    return one.expected(bins, estimate.quantities[number], estimate.depths(bins), estimate.parameters)
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_derivatives_are_those_of_simulations_with_other_parameters(axes, number):
+    estimate, _ = followed(axes)
+    estimate = differentiate(estimate, simulate_due(estimate, estimate.parameters, range(estimate.slots.end)))
+    one, bins, ends = estimate.along[number], estimate.bins[number], estimate.quantities[number]
+    depth = estimate.depths(bins)
+    jacobian = one.jacobian(
+        bins, ends, depth, estimate.along_slopes(depth, number), estimate.parameters, estimate.timeline
+    )
+    sd = np.sqrt(np.diag(estimate.covariance))
+    scale = one.sensor.noise
+    before = expected(estimate.simulate_with(estimate.parameters), number)
+    for k in range(estimate.parameters.size):
+        if k == one.slots.clock:
+            continue
+        step = estimate.prior.steps[k] if k < estimate.slots.end else sd[k]
+        shifted = estimate.parameters + step * (np.arange(sd.size) == k)
+        change = (expected(estimate.simulate_with(shifted), number) - before) * sd[k] / step
+        seen = bins.count > 0.0
+        assert np.abs(change - jacobian[:, :, k] * sd[k])[seen].max(initial=0.0) < 0.25 * scale, k
+
+
+def test_the_derivative_to_the_clock_is_that_of_readings_at_other_times():
+    """In moves whose readings stay in them; the needle rolls and bends between the ends of a move."""
+    estimate, _ = followed()
+    one, ends, step = estimate.along[0], estimate.quantities[0], 1e-4
+
+    def residual(clock):
+        bins = one.bins(estimate.timeline, clock)
+        parameters = estimate.parameters.copy()
+        parameters[one.slots.clock] = clock
+        return bins, bins.value - one.expected(bins, ends, estimate.depths(bins), parameters)
+
+    bins, off = residual(0.0)
+    later, shifted = residual(step)
+    same = (bins.count == later.count).all(axis=1) & np.isin(
+        bins.index, np.flatnonzero(estimate.timeline.turned)
+    )
+    assert same.sum() >= 1
+    depth = estimate.depths(bins)
+    jacobian = one.jacobian(
+        bins, ends, depth, estimate.along_slopes(depth, 0), estimate.parameters, estimate.timeline
+    )
+    found, known = -(shifted - off)[same] / step, jacobian[same][:, :, one.slots.clock]
+    np.testing.assert_allclose(found, known, atol=0.2 * np.abs(known).max())  # of noisy readings
+
+
+def test_the_estimate_is_near_the_truth_and_says_how_near():
+    estimate, rig = followed()
+    off = np.subtract(rig.truth().tip[1:3], estimate.tip[1:3])
+    assert np.hypot(*off) < 0.1
+    assert off @ np.linalg.solve(estimate.tip_covariance[1:, 1:], off) < 14.0
+
+
+def test_a_constant_error_of_the_tracker_is_found_with_a_guide():
+    bias = {"phantom.tracker_bias_mm": 2.0, "tracker.bias_sd_mm": 1.5, "control.start_axial_sd_mm": 0.0}
+    estimate, rig = followed(**bias, **{"phantom.start_axial_sd_mm": 0.0})
+    assert np.linalg.norm(np.subtract(rig.truth().tip[:3], estimate.tip[:3])) < 0.25
+    assert np.linalg.norm(estimate.bias) == pytest.approx(2.0, abs=0.25)
+
+
+def test_a_sensor_without_weight_changes_nothing():
+    plain, _ = followed()
+    none = plain.change(along=tuple(one.without(0.0) for one in plain.along))
+    assert not any(one.used.any() for one in none.along)
+    assert none.along_residuals[0].size == 0
+
+
+def test_white_rows_have_the_inverse_of_the_covariance_as_weight():
+    rng = np.random.default_rng(0)
+    variance, distance = rng.uniform(0.5, 2.0, 7), np.sort(rng.uniform(0.0, 3.0, 7))
+    rows, values = rng.normal(size=(7, 3)), rng.normal(size=7)
+    covariance = np.diag(variance) + 1.3**2 * np.exp(-np.abs(distance[:, None] - distance))
+    white, values_white = whiten([rows, values], variance, 1.3, distance)
+    np.testing.assert_allclose(white.T @ values_white, rows.T @ np.linalg.solve(covariance, values))
+    variance[2] = np.inf
+    kept = np.arange(7) != 2
+    white, values_white = whiten([rows, values], variance, 1.3, distance)
+    part = covariance[np.ix_(kept, kept)]
+    np.testing.assert_allclose(white.T @ values_white, rows[kept].T @ np.linalg.solve(part, values[kept]))
+
+
+def test_readings_are_averaged_over_the_moves_in_which_they_were_taken():
+    estimate, _ = followed()
+    one, bins, line = estimate.along[1], estimate.bins[1], estimate.timeline
+    index, _, _ = line.at(one.time - one.clock(estimate.parameters))
+    for k, move in enumerate(bins.index):
+        mine = one.value[index == move]
+        np.testing.assert_allclose(bins.count[k], np.isfinite(mine).sum(axis=0))
+        if np.isfinite(mine).all():
+            np.testing.assert_allclose(bins.value[k], mine.mean(axis=0))
+    assert (np.diff(bins.index) > 0).all()
+    np.testing.assert_allclose(
+        between(bins, np.arange(len(line.begun) + 1.0)[:, None])[:, 0], bins.index + bins.part
+    )
+
+
+def test_the_conflict_of_linear_sensors_is_the_cost_of_their_fit_beyond_those_of_each():
+    """Against least squares on all rows at once."""
+    estimate, _ = followed()
+    size, rng = estimate.parameters.size, np.random.default_rng(4)
+    prior, off = estimate.prior.precision, estimate.parameters - estimate.prior.mean
+    parts, problems = [], {}
+    for name, rows in ((TRACKER, 40), ("fbg", 90)):
+        matrix, left = rng.normal(size=(rows, size)), rng.normal(size=rows)
+        parts.append(Part(name, 0.5 * left @ left, rows, matrix.T @ left, matrix.T @ matrix, 1.0))
+        problems[name] = matrix, left
+
+    def cost(names):
+        matrix = np.concatenate([problems[name][0] for name in names])
+        left = np.concatenate([problems[name][1] for name in names])
+        step = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ left - prior @ off)
+        rest, there = left - matrix @ step, off + step
+        return 0.5 * rest @ rest + 0.5 * there @ prior @ there
+
+    both = estimate.change(parts=tuple(parts))
+    conflict = cost([TRACKER, "fbg"]) - cost([TRACKER]) - cost(["fbg"])
+    assert both.conflict("fbg") == pytest.approx(conflict, rel=1e-6)
+    assert both.conflict(TRACKER) == pytest.approx(conflict, rel=1e-6)
+    assert both.misfit("fbg") == pytest.approx(cost([TRACKER]) / 40.0, rel=1e-6)

@@ -1,0 +1,191 @@
+"""Insertions with sensors along the needle: losses, faults, holds."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.estimation.along import Comparison
+from flexneedle.loop.fusing import judge_conflict
+from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
+from flexneedle.loop.virtual import Seeds, virtual_rig
+from flexneedle.types import Reading, VerdictKind
+
+FBG = {"kind": "fbg", "sites_mm": [11, 26, 70, 105]}
+SLICES = [{"kind": "slice", "name": f"slice {k}", "plane_mm": x} for k, x in ((1, 12.0), (2, 25.0))]
+HOMED = {"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0}
+
+
+@cache
+def planned():
+    """Scenario in space, and its plan."""
+    scenario = flexneedle.load_scenario("phantom3d")
+    return scenario, flexneedle.plan(scenario, seed=0)
+
+
+def inserted(*sensors, seed=3, **changes):
+    """An insertion with sensors along the needle."""
+    scenario, plan = planned()
+    changes = {key.replace("__", "."): value for key, value in changes.items()}
+    return flexneedle.insert(scenario.with_values({"sensor": [*sensors], **changes}), plan, seed=seed)
+
+
+def off(insertion):
+    """Lateral error of the estimate at the end (mm)."""
+    last = insertion.periods[-1]
+    return math.dist(last.estimate.point[1:], last.true_tip.point[1:])
+
+
+def excluded(insertion, name):
+    """Depth (mm) at which a sensor was excluded, and the verdict; None without."""
+    for period in insertion.periods:
+        for one in period.sensors:
+            if one.name == name and not one.verdict.ok:
+                return period.true_tip.x, one.verdict
+    return None
+
+
+def test_a_lost_tracker_ends_an_insertion_and_with_a_fibre_it_does_not():
+    lost = {"phantom__tracker_lost_mm": 18.0}
+    alone = inserted(**lost)
+    assert alone.outcome == "held"
+    assert "not measured" in alone.reason
+    sensed = inserted(FBG, **lost)
+    assert sensed.outcome == "done"
+    assert off(sensed) < 0.25
+    assert not any(one.verdict.ok for period in sensed.periods[-3:] for one in period.readings)
+
+
+def test_without_a_tracker_and_at_a_known_depth_a_fibre_leads_to_the_target():
+    insertion = inserted(FBG, tracker__enabled=False, **{k.replace(".", "__"): v for k, v in HOMED.items()})
+    assert insertion.outcome == "done"
+    assert insertion.true_error_mm < 0.8
+    assert not any(period.readings for period in insertion.periods)
+
+
+def test_two_slices_find_a_constant_error_of_the_tracker():
+    changes = {"phantom__tracker_bias_mm": 2.7, "tracker__bias_sd_mm": 1.5}
+    insertion = inserted(*SLICES, **changes, **{k.replace(".", "__"): v for k, v in HOMED.items()})
+    assert insertion.outcome == "done"
+    assert off(insertion) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("fault", "size", "kind"), [("frozen", 1.0, "frozen"), ("drift", 0.4, "contradicted")]
+)
+def test_a_faulty_fibre_is_excluded_and_the_needle_comes_to_its_target(fault, size, kind):
+    sensor = {**FBG, "phantom": {"fault": {"kind": fault, "depth_mm": 12.0, "size": size}}}
+    insertion = inserted(sensor)
+    depth, verdict = excluded(insertion, "fbg")
+    assert verdict.kind is VerdictKind(kind)
+    assert 12.0 < depth < 24.0
+    assert insertion.outcome == "done"
+    assert off(insertion) < 0.1
+    readings = [one for period in insertion.periods[-3:] for state in period.sensors for one in state.good]
+    assert not readings
+
+
+def test_an_undeclared_error_of_the_tracker_that_grows_holds_the_needle():
+    insertion = inserted(FBG, phantom__tracker_drift_mm=2.7)
+    assert insertion.outcome == "held"
+    assert "contradict" in insertion.reason
+    assert off(insertion) < 1.1
+
+
+def test_in_a_distorted_field_a_fibre_leads_to_the_target():
+    """The references show how large the tracker's error is; without a fibre the needle is held in air."""
+    changes = {"tracker__environment": "noisy"} | {
+        key.replace(".", "__"): value for key, value in HOMED.items()
+    }
+    insertion = inserted(FBG, **changes)
+    assert insertion.outcome == "done"
+    assert off(insertion) < 0.4
+    assert inserted(**changes).outcome == "held"
+
+
+def test_healthy_sensors_are_not_excluded():
+    insertion = inserted(FBG, *SLICES)
+    assert insertion.outcome == "done"
+    assert (
+        excluded(insertion, "fbg") is excluded(insertion, "slice 1") is excluded(insertion, "slice 2") is None
+    )
+    states = [one for period in insertion.periods for one in period.sensors if one.name == "fbg"]
+    assert 0.1 < np.nanmedian([one.nis for one in states]) < 2.0
+
+
+def test_the_needle_is_held_where_the_tip_is_not_known_well_enough():
+    slow = {"kind": "slice", "plane_mm": 12.0, "noise_mm": 5.0}
+    insertion = inserted(slow, phantom__tracker_lost_mm=5.0, control__tip_sd_limit_mm=0.05)
+    assert insertion.outcome == "held"
+    assert "tip uncertain" in insertion.reason
+    assert "limit 0.05 mm" in insertion.reason
+
+
+def test_the_same_seed_gives_the_same_insertion():
+    one, again = inserted(FBG), inserted(FBG)
+    assert [p.estimate for p in one.periods] == [p.estimate for p in again.periods]
+    assert [p.sensors for p in one.periods[1:]] == [p.sensors for p in again.periods[1:]]
+
+
+def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
+    scenario, plan = planned()
+    rig = virtual_rig(scenario, plan.roll, Seeds.of(0))
+    with pytest.raises(flexneedle.RigError, match="lacks fbg"):
+        flexneedle.insert(scenario.with_values({"sensor": [FBG]}), plan, rig=rig)
+
+
+@pytest.mark.parametrize(
+    ("conflict", "misfits", "faulty", "held"),
+    [
+        (5.0, {"tracker": 2.0, "fbg": 0.1}, "", False),
+        (7.0, {"tracker": 0.5, "fbg": 0.1}, "fbg", False),
+        (7.0, {"tracker": 0.2, "fbg": 0.1}, "", False),  # not clear yet
+        (13.0, {"tracker": 0.2, "fbg": 0.1}, "fbg", False),
+        (13.0, {"tracker": 0.12, "fbg": 0.1}, "", True),
+        (7.0, {"tracker": 0.1, "fbg": 0.12}, "tracker", True),
+        (7.0, {"tracker": 0.9, "a": 0.8, "b": 0.1}, "b", False),
+    ],
+)
+def test_the_faulty_sensor_is_the_one_without_which_the_others_agree(conflict, misfits, faulty, held):
+    found, verdict = judge_conflict(dict.fromkeys(misfits, conflict), misfits)
+    assert found == faulty
+    assert (not verdict.ok) == bool(faulty or held)
+
+
+def test_readings_are_checked_one_by_one():
+    rows = ((1.0, 0.0),)
+    readings = [
+        Reading(1.0, rows),
+        Reading(1.0, ((9.0, 0.0),)),
+        Reading(1.0, (), "missing"),
+        Reading(0.1, rows),
+        Reading(math.nan, rows),
+    ]
+    values = np.array([[1.0, 0.0], [9.0, 0.0], [np.nan, np.nan], [1.0, 0.0], [1.0, 0.0]])
+    compared = Comparison(values, values - [1.0, 0.0], 0.5 * np.eye(2), 0.5)
+    kinds = [one.verdict.kind.value for one in check_readings(readings, compared, 1.1, 0.3)]
+    assert kinds == ["ok", "outlier", "missing", "stale", "not a number"]
+    mean = compared.nis(np.array([True, False, False, True, False]))
+    assert mean == pytest.approx(0.0)
+
+
+def test_the_normalised_square_is_one_on_average():
+    rng = np.random.default_rng(0)
+    covariance = np.array([[0.4, 0.1], [0.1, 0.2]])
+    found = []
+    for _ in range(4000):
+        shared = rng.multivariate_normal([0.0, 0.0], covariance)
+        residual = shared + rng.normal(0.0, 0.5, (5, 2))
+        found.append(Comparison(residual, residual, covariance, 0.5).nis(np.ones(5, dtype=bool)))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.05)
+
+
+def test_readings_that_repeat_are_frozen_once_the_tip_has_travelled():
+    same = [Reading(0.1 * k, ((1.0, 2.0),)) for k in range(12)]
+    state = SensorMonitor().add(same, 5.0)
+    assert state.check_frozen(5.1, 0.3, 0.0).ok
+    assert state.check_frozen(5.5, 0.3, 0.0).kind is VerdictKind.FROZEN
+    assert state.check_frozen(5.5, 0.3, 0.1).ok  # of a sensor with steps
+    assert state.add([Reading(2.0, ((1.0, 2.1),))], 5.5).check_frozen(9.0, 0.3, 0.0).ok
