@@ -174,6 +174,7 @@ front: setup  ## error against peak tissue energy of five controllers and the or
 calibration: setup  ## fits of 100 sets of simulated recordings, and 50 closed loops without and with a calibration (half an hour)
 	$(BIN)/python studies/calibration.py sets $(call quick,--count 1)
 	$(BIN)/python studies/calibration.py loops $(call quick,--count 1)
+	$(BIN)/python studies/calibration_sensors.py $(call quick,--count 1)
 
 sensors: setup  ## insertions with sensors along the needle, healthy and faulty, in 140 random worlds (hours)
 	$(BIN)/python studies/sensors.py --out $(OUT) $(call quick,--worlds 100001 1 --unguided 0 --rows "lost$(comma) fbg")

@@ -1,11 +1,13 @@
 """Sessions of recorded insertions that the model itself has made, with errors of readings."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from flexneedle.lab.calibration.parameters import make_needle, parameters_of, trial_of
 from flexneedle.lab.calibration.prediction import Replay, fitting_scenario
+from flexneedle.lab.calibration.readings import StepReading
 from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.scenario.files import load_scenario
 
@@ -40,10 +42,7 @@ def simulate(
 
 
 def measured(session, scenario, angle, noise, random):
-    prepared = fitting_scenario(scenario, session)
-    bevel = scenario.needle.bevel.offset_mm * np.array([np.cos(angle), np.sin(angle)])[: session.axes]
-    trial = trial_of(prepared, parameters_of(prepared, ("bevel",), 0.0), bevel)
-    tips, _ = Replay.of(session).predict([make_needle(prepared, trial)])
+    tips, _ = Replay.of(session).predict([true_needle(session, scenario, angle)])
     for one, tip in zip(session.recordings, tips[0], strict=True):
         shape = one.position.shape
         yield replace(
@@ -52,6 +51,65 @@ def measured(session, scenario, angle, noise, random):
             position=tip[:, 1 : 1 + session.axes] + noise * random.standard_normal(shape),
             slope=tip[:, 3 : 3 + session.axes] + AXIS[: session.axes] + 1e-3 * random.standard_normal(shape),
         )
+
+
+def true_needle(session, scenario, angle):
+    """Return the needle of a scenario with its bevel at an angle (rad) from y."""
+    prepared = fitting_scenario(scenario, session)
+    bevel = scenario.needle.bevel.offset_mm * np.array([np.cos(angle), np.sin(angle)])[: session.axes]
+    return make_needle(prepared, trial_of(prepared, parameters_of(prepared, ("bevel",), 0.0), bevel))
+
+
+FIBRE = {"kind": "fbg", "sites_mm": [8.0, 20.0, 45.0, 80.0]}
+
+
+@dataclass(frozen=True)
+class Fibre:
+    """Errors of a fibre: noise and offsets (1/m), gains of its sites, turn about the needle (rad)."""
+
+    noise: float = 0.05
+    offset: float = 0.1
+    gains: tuple = (1.02, 0.97, 1.04, 0.99)
+    turn: float = 0.02
+
+
+def with_curvatures(session, scenario, angle=0.6, fibre=Fibre(), seed=9):
+    """Return the session with curvatures of a fibre in the needle of a scenario, each step measured twice."""
+    random, errors = np.random.default_rng(seed), fibre
+    needle, replay = true_needle(session, scenario, angle), Replay.of(session)
+    replay = replay.corrected(replay.predict([needle])[0][0])
+    _, _, shapes = replay.carry_out([needle], ("shapes",))
+    offset = errors.offset * random.standard_normal((len(FIBRE["sites_mm"]), session.axes))
+    return replace(
+        session,
+        recordings=tuple(
+            replace(one, readings=tuple(_readings(one, each, errors, offset, random)))
+            for one, each in zip(session.recordings, shapes[0], strict=True)
+        ),
+    )
+
+
+def _readings(one, shapes, errors, offset, random):
+    for step in range(len(one.depth)):
+        bent = 1e3 * curvatures(shapes[step]) * np.array(errors.gains)
+        facing = bent * np.exp(1j * (errors.turn - one.roll[step]))
+        flat = np.stack([facing.real, facing.imag], axis=1)[:, : one.axes] + offset
+        for _ in range(2):
+            rows = 1e-3 * (flat + errors.noise * random.standard_normal(flat.shape))
+            yield StepReading("fbg", step, tuple(map(tuple, rows.tolist())))
+
+
+def curvatures(poses, gauge=5.0):
+    """Return the mean curvature y + iz (1/mm) of a needle with poses (n, 5) about each site, by splines of its axis."""
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)))
+    tangent = CubicSpline(along, poses[:, :3]).derivative()
+    sites = along[-1] - np.array(FIBRE["sites_mm"])
+
+    def tilt(at):
+        x, y, z = tangent(at).T
+        return np.arctan2(np.hypot(y, z), x) * np.exp(1j * np.arctan2(z, y))
+
+    return (tilt(sites + gauge / 2) - tilt(sites - gauge / 2)) / gauge
 
 
 def without_slopes(session):

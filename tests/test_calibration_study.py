@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import calibration
+import calibration_sensors
 from calibration import Choice
 from flexneedle.errors import InputError
 from flexneedle.lab.calibration.intervals import Interval
@@ -182,3 +183,27 @@ def test_a_calibrated_loop_is_more_accurate_on_the_same_phantom():
     row = calibration.close_loop(0, Choice(calibration.FIT, "world"))
     assert row["true"]["stiffness"] > 10.0
     assert row["calibrated"]["error_mm"] < 0.5 * row["as_is"]["error_mm"]
+
+
+def test_sensors_are_placed_for_the_depth_of_the_insertions():
+    scenario = calibration.guided_world(0, "world")
+    sensors = [
+        calibration_sensors.with_sensor(scenario, kind, 50.0).sensor for kind in calibration_sensors.SENSORS
+    ]
+    assert [[each.kind for each in one] for one in sensors] == [[], ["fbg"], ["points"], ["slice"]]
+    assert (sensors[2][0].to_mm, sensors[3][0].plane_mm) == (50.0, 20.0)
+
+
+def test_the_table_of_sensors_counts_identified_stiffness_only():
+    row = {"spread": [0.4, 0.2, 0.1], "bevel_covered": True, "problems": [], "bent": 0.6}
+    known = row | {"stiffness_identified": True, "stiffness_error": 0.3, "stiffness_covered": True}
+    other = known | {"stiffness_identified": False, "stiffness_error": 9.0, "stiffness_covered": False}
+    rows = [
+        {"guide": guide, "kind": kind, **each}
+        for guide in calibration_sensors.GUIDES
+        for kind in calibration_sensors.SENSORS
+        for each in (known, other)
+    ]
+    lines = calibration_sensors.summarize(rows).splitlines()
+    assert lines[11] == "Fibre at rest, curvature from 0.5 1/m: 1 of 2 identified, rms error 0.300"
+    assert lines[2] == "|at rest|tip alone|2|1|0.300|100 %|100 %|0.40, 0.20, 0.10|0|"

@@ -76,6 +76,6 @@ def test_candidates_differ_and_move_the_guide_to_and_fro(axes):
 def test_widths_are_printed_as_factors_or_lengths():
     widths = dict(propose(GEL, NAMES, 1)[0].widths)
     texts = [parameter.format_width(width) for parameter, width in widths.items()]
-    assert texts[0] == f"stiffness of gel ×÷ {math.exp(next(iter(widths.values()))):.3g}"
-    assert texts[1].startswith("bevel ± ")
+    assert texts[0] == f"×÷ {math.exp(next(iter(widths.values()))):.3g}"
+    assert texts[1].startswith("± ")
     assert texts[1].endswith(" mm")

@@ -175,6 +175,22 @@ class Calibration:
             rows.append((each.label, f"{value:.4g} {each.unit}".rstrip(), f"{low:.4g} to {high:.4g}"))
         return rows
 
+    def by_readings(self) -> list[tuple[str, ...]]:
+        """Return rows of a table: parameter, half-width of its interval of 95 % by the tip, by sensors, and by both.
+
+        With the errors at the fit of all parameters, before the scatter of insertions; none without sensors along the
+        needle.
+        """
+        fitted = self.fitted
+        if not fitted.problem.sensors:
+            return []
+        parts = slice(fitted.tip_errors), slice(fitted.tip_errors, None), slice(None)
+        widths = np.stack([1.96 * fitted.sds_by(part)[: len(self.parameters)] for part in parts], axis=1)
+        return [
+            (each.label, *(each.format_width(width) for width in row))
+            for each, row in zip(self.parameters, widths.tolist(), strict=True)
+        ]
+
 
 def calibrate(
     scenario: Scenario | str | Path, session: Session, fit: Sequence[str] = DEFAULT_FIT
@@ -203,7 +219,9 @@ def make_problem(scenario: Scenario, session: Session, names: Sequence[str]) -> 
     """Return the fit of parameters by name. Raises as `calibrate`."""
     used = shallow(session)
     prepared, replay = fitting_scenario(scenario, used), Replay.of(used)
-    return Problem(prepared, parameters_of(prepared, names, replay.reached), replay)
+    read = {each.sensor for one in used.recordings for each in one.readings}
+    sensors = tuple(each for each in prepared.sensor if each.title in read)
+    return Problem(prepared, parameters_of(prepared, names, replay.reached), replay, sensors)
 
 
 def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:

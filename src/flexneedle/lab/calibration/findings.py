@@ -62,6 +62,10 @@ def find_notes(found: "Calibration") -> Iterator[str]:
         )
     if len(recordings) < LEAST_RECORDINGS:
         yield f"intervals are too narrow: from fewer than {LEAST_RECORDINGS} insertions"
+    used_sensors = {each.title for each in found.fitted.problem.sensors}
+    for name in dict.fromkeys(each.sensor for one in recordings for each in one.readings):
+        if name not in used_sensors:
+            yield f"readings of {name} are not used: the scenario has no [[sensor]] of this name"
     yield from _find_open_values(found)
     if abs(found.direction) > _TURNED:
         angle = f"{np.degrees(found.direction):.0f}°"

@@ -1,5 +1,6 @@
 """The fit: robust least squares of the errors of predictions ahead, alternating with the noise they follow from."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,11 +9,25 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from flexneedle.estimation.along import SensorFit
+from flexneedle.lab.calibration.along import (
+    FIRST_FACTORS,
+    Along,
+    AlongPath,
+    Joint,
+    StepMeans,
+    estimate_factors,
+    lay_out,
+    path_along,
+    read_means,
+    residuals_along,
+)
 from flexneedle.lab.calibration.criteria import Criterion, predict_ahead
 from flexneedle.lab.calibration.deviations import KINDS, Deviations, Noise, Whitened, estimate_noise
 from flexneedle.lab.calibration.parameters import Parameter, make_needle, trial_of
 from flexneedle.lab.calibration.prediction import Replay
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import Flags, Floats
 
 _ROUNDS = 10  # of parameters, noise and weights
@@ -24,15 +39,18 @@ _FAR = 20.0  # standard deviations, to the bounds of axis and lever
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A fit: scenario, parameters, recordings.
+    """A fit: scenario, parameters, recordings, and sensors along the needle whose readings count.
 
     The point of a fit has the p parameters, then for each session the slope (rad) of the sensor's axis on each axis,
-    and the lever of the sensor (mm): its distance from the point whose path the model predicts, along the needle.
+    and the lever of the sensor (mm): its distance from the point whose path the model predicts, along the needle. Then
+    for each session the errors of the sensors along the needle. means: of their readings, from the start of a fit on.
     """
 
     scenario: Scenario
     parameters: tuple[Parameter, ...]
     replay: Replay
+    sensors: tuple[Sensor, ...] = ()
+    means: tuple[StepMeans, ...] = ()
 
     @cached_property
     def sessions(self) -> tuple[str, ...]:
@@ -47,7 +65,18 @@ class Problem:
     @cached_property
     def _nuisances(self) -> Floats:
         """Standard deviations of what is fitted besides the parameters."""
-        return np.tile([*(_AXIS_SD,) * self.replay.axes, _LEVER_SD], len(self.sessions))
+        tips = np.tile([*(_AXIS_SD,) * self.replay.axes, _LEVER_SD], len(self.sessions))
+        return np.append(tips, [sd for _, sds in self._along for sd in sds])
+
+    @cached_property
+    def _along(self) -> list[tuple[tuple[SensorFit, ...], list[float]]]:
+        """Sensors along the needle of each session, and standard deviations of their errors."""
+        begin = len(self.parameters) + (self.replay.axes + 1) * len(self.sessions)
+        found = []
+        for _ in self.sessions:
+            found.append(lay_out(self.sensors, self.replay.axes, begin))
+            begin += len(found[-1][1])
+        return found
 
     @cached_property
     def start(self) -> Floats:
@@ -66,10 +95,27 @@ class Problem:
         low = np.append([each.low for each in self.parameters], -far)
         return np.stack([low, np.append([each.high for each in self.parameters], far)])
 
-    def tips(self, points: Sequence[Floats]) -> tuple[Floats, Flags]:
-        """Return the tips (v, n, k, 5) at points, and whether all solves converged (v, n)."""
+    def carry_out(self, points: Sequence[Floats]) -> tuple[Floats, Flags, Floats]:
+        """Return the tips (v, n, k, 5) at points, whether all solves converged (v, n), and shapes for the sensors."""
         trials = [trial_of(self.scenario, self.parameters, point[: len(self.parameters)]) for point in points]
-        return self.replay.predict([make_needle(self.scenario, trial) for trial in trials])
+        wanted = ("shapes",) if self.sensors else ()
+        return self.replay.carry_out([make_needle(self.scenario, trial) for trial in trials], wanted)
+
+    def with_means(self, shapes: Floats) -> "Problem":
+        """Return the problem with the readings of the sensors, at needles with shapes (n, k, nodes, 5)."""
+        means = [
+            each
+            for n, one in enumerate(self.replay.recordings if self.sensors else ())
+            for each in read_means(
+                n, one, self._along[self.sessions.index(one.session)][0], shapes[n], self.length
+            )
+        ]
+        return replace(self, means=tuple(means))
+
+    @property
+    def length(self) -> float:
+        """Length (mm) of the needle."""
+        return self.scenario.needle.length_mm
 
     def nuisances(self, recording: int) -> slice:
         """Return the place of the axis and the lever of a recording's sensor in a point."""
@@ -83,6 +129,7 @@ class Residuals:
     """Residuals of all recordings at a point on all axes, with their derivatives.
 
     values: (r,) for each recording and axis; slopes: (r, p + s); models: predicted readings (2 k,); tips (n, k, 5).
+    along: of each sensor along the needle in each recording; shapes (n, k, nodes, 5): for these.
     """
 
     values: list[Floats]
@@ -90,6 +137,8 @@ class Residuals:
     models: list[Floats]
     tips: Floats
     converged: bool
+    along: list[Along]
+    shapes: Floats
 
 
 def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -> Residuals:
@@ -101,7 +150,7 @@ def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -
     points = [point]
     if derivatives:
         points += [point + np.eye(len(point))[k] * signs[k] * steps[k] for k in range(size)]
-    tips, good = problem.tips(points)
+    tips, good, shapes = problem.carry_out(points)
     change = [(tips[1 + k] - tips[0]) / (signs[k] * steps[k]) for k in range(len(points) - 1)]
     values, slopes, models = list[Floats](), list[Floats](), list[Floats]()
     for n, one in enumerate(problem.replay.recordings):
@@ -122,7 +171,15 @@ def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -
             values.append((found - model)[known])
             slopes.append(derivative[known])
             models.append(model)
-    return Residuals(values, slopes, models, tips[0], bool(good.all()))
+    recordings, length = problem.replay.recordings, problem.length
+    along = [
+        residuals_along(
+            each, recordings[each.recording], shapes[:, each.recording], length, signs * steps, point
+        )
+        for each in problem.means
+    ]
+    none = shapes[0] if problem.sensors else shapes
+    return Residuals(values, slopes, models, tips[0], bool(good.all()), along, none)
 
 
 def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
@@ -138,12 +195,32 @@ def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
     return paths
 
 
+def paths_along(problem: Problem, found: Residuals) -> list[AlongPath]:
+    """Return the covariances of each sensor along the needle in each recording about the model's needles."""
+    recordings, target = problem.replay.recordings, problem.scenario.target.depth_mm
+    sessions = Counter(one.session for one in recordings)
+    return [
+        path_along(
+            means,
+            recordings[means.recording],
+            found.shapes[means.recording],
+            problem.length,
+            target,
+            each,
+            sessions[recordings[means.recording].session],
+        )
+        for means, each in zip(problem.means, found.along, strict=True)
+    ]
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """The end of a fit: point, noise, and what the criterion has there.
 
     cost: the loss, with the prior; errors (m,), with the weights of iterated least squares, derivatives (m, p + s), and
     groups (m,), the recording of each; residuals: at the point; settled: whether the rounds ended before the last.
+    factors: on noise and model error of each sensor along the needle; tip_errors: number of the errors of tips, which
+    are first.
     """
 
     problem: Problem
@@ -157,6 +234,14 @@ class Fitted:
     groups: Any
     residuals: Residuals
     settled: bool
+    factors: dict[str, Floats]
+    tip_errors: int
+
+    def sds_by(self, rows: slice) -> Floats:
+        """Return standard deviations (p + s,) by some of the errors, and the prior."""
+        some = self.slopes[rows]
+        found: Floats = np.sqrt(np.diag(np.linalg.inv(some.T @ some + np.diag(self.problem.sd**-2.0))))
+        return found
 
     @cached_property
     def information(self) -> Floats:
@@ -201,16 +286,22 @@ def fit(
     noise = noise or Noise.first()
     found = residuals_at(problem, point)
     problem = replace(problem, replay=problem.replay.corrected(found.tips))
+    if problem.sensors:
+        problem = problem.with_means(residuals_at(problem, point, derivatives=False).shapes)
     found = residuals_at(problem, point)
-    paths = paths_at(problem, found.tips)
+    paths, along = paths_at(problem, found.tips), paths_along(problem, found)
+    factors = {each.sensor: FIRST_FACTORS for each in along}
     for _ in range(rounds):
         before = point
-        point, found = _least_squares(problem, criterion.of(paths, noise, found.values), point)
+        given = Joint.of(criterion.of(paths, noise, found.values), along, factors)
+        point, found = _least_squares(problem, given, point)
         new = paths_at(problem, found.tips)
         paths = [replace(path, factors=old.factors) for path, old in zip(new, paths, strict=True)]
         noise = estimate_noise(paths, found.values, noise)
         paths = [path.with_factors_for(noise, value) for path, value in zip(paths, found.values, strict=True)]
-        ended = conclude(problem, criterion, paths, noise, point, found)
+        along = paths_along(problem, found)
+        factors = estimate_factors(along, [each.value for each in found.along], factors)
+        ended = conclude(problem, criterion, paths, noise, point, found, along, factors)
         scale = np.sqrt(np.diag(np.linalg.inv(ended.information)))
         if (np.abs(point - before) < _SETTLED * scale).all():
             return replace(ended, settled=True)
@@ -224,31 +315,37 @@ def conclude(
     noise: Noise,
     point: Floats,
     found: Residuals,
+    along: Sequence[AlongPath] = (),
+    factors: dict[str, Floats] | None = None,
 ) -> Fitted:
     """Return the fit at a point, not settled."""
-    given = criterion.of(paths, noise, found.values)
+    given = Joint.of(criterion.of(paths, noise, found.values), along, factors or {})
     errors, slopes = _errors(given, found)
     loss, weight, _ = given.rho(errors**2)
     off = (point - problem.start) / problem.sd
     axes = problem.replay.axes
-    groups = np.repeat(np.arange(len(paths)) // axes, [len(each) for each in given.rows])
+    owners = [*(np.arange(len(paths)) // axes).tolist(), *(each.recording for each in along)]
+    groups = np.repeat(owners, [len(each) for each in given.rows])
     root = np.sqrt(weight)
     return Fitted(
         problem, criterion, point, noise, paths, float(loss.sum() + off @ off) + given.constant,
-        root * errors, root[:, None] * slopes, groups, found, False,
+        root * errors, root[:, None] * slopes, groups, found, False, factors or {},
+        sum(map(len, given.tip.rows)),
     )  # fmt: skip
 
 
-def _errors(criterion: Criterion, found: Residuals) -> tuple[Floats, Floats]:
+def _errors(criterion: Joint, found: Residuals) -> tuple[Floats, Floats]:
     """Return errors (m,) and their derivatives (m, p + s), of the opposite sign."""
     rows = criterion.rows
+    values = [*found.values, *(each.value for each in found.along)]
+    slopes = [*found.slopes, *(each.slopes for each in found.along)]
     return (
-        np.concatenate([each @ value for each, value in zip(rows, found.values, strict=True)]),
-        np.concatenate([each @ slope for each, slope in zip(rows, found.slopes, strict=True)]),
+        np.concatenate([each @ value for each, value in zip(rows, values, strict=True)]),
+        np.concatenate([each @ slope for each, slope in zip(rows, slopes, strict=True)]),
     )
 
 
-def _least_squares(problem: Problem, criterion: Criterion, start: Floats) -> tuple[Floats, Residuals]:
+def _least_squares(problem: Problem, criterion: Joint, start: Floats) -> tuple[Floats, Residuals]:
     """Return the point of the least loss of a criterion, and its residuals."""
     known: dict[bytes, Residuals] = {}
     size = len(start)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2, t
 
-from flexneedle.lab.calibration.fit import Fitted, Problem, fit
+from flexneedle.lab.calibration.fit import Fitted, fit
 from flexneedle.lab.calibration.parameters import at_same_curvature
 from flexneedle.types import Floats
 
@@ -19,6 +19,7 @@ _NORMAL = (
 SAME_COST = float(chi2.ppf(_LEVEL, 1))
 """Rise of the cost up to which two values of a parameter fit alike."""
 _BY_MOTION = ("stiffness", "guide", "clearance", "yield")
+_NARROWED = 0.8  # of the prior's standard deviation
 _FAR = 1.4  # distance of the points of the profile that test whether a logarithm is identified: a factor 4
 
 
@@ -90,9 +91,16 @@ def _is_identified(fitted: Fitted, k: int, width: float) -> bool:
     the needle the entry alone identifies nothing but the bevel.
     """
     parameter = fitted.problem.parameters[k]
-    if width > parameter.useful or (parameter.name in _BY_MOTION and not fitted.problem.moves):
+    if width > parameter.useful or (parameter.name in _BY_MOTION and not _is_informed(fitted, k)):
         return False
     return parameter.name != "stiffness" or all(rise > SAME_COST for rise in _rises(fitted, k))
+
+
+def _is_informed(fitted: Fitted, k: int) -> bool:
+    """Return whether guide or base moves, or sensors along the needle give a parameter without the tip."""
+    along = fitted.sds_by(slice(fitted.tip_errors, None))[k]
+    useful = fitted.problem.parameters[k].useful
+    return fitted.problem.moves or bool(_NORMAL * along < useful and along < _NARROWED * fitted.problem.sd[k])
 
 
 def _rises(fitted: Fitted, k: int) -> Iterator[float]:
@@ -113,9 +121,7 @@ def fixed(fitted: Fitted, k: int, value: float, **limits: int) -> Fitted:
         layers = sum(each.name == "stiffness" for each in parameters)
         start = at_same_curvature(parameters, start, (value - start[k]) / layers)
     start[k] = value
-    return fit(
-        Problem(problem.scenario, parameters, problem.replay), fitted.criterion, start, fitted.noise, **limits
-    )
+    return fit(replace(problem, parameters=parameters), fitted.criterion, start, fitted.noise, **limits)
 
 
 def profile(fitted: Fitted, k: int, values: Sequence[float]) -> Floats:

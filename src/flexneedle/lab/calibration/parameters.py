@@ -68,10 +68,10 @@ class Parameter:
         return math.exp(coordinate) if self.log else coordinate
 
     def format_width(self, width: float) -> str:
-        """Return the half-width of an interval as text, with the label: a factor to either side for a logarithm."""
+        """Return the half-width of an interval as text: a factor to either side for a logarithm."""
         if self.log:
-            return f"{self.label} ×÷ {math.exp(min(width, 99.0)):.3g}"
-        return f"{self.label} ± {width:.2g} {self.unit}".rstrip()
+            return f"×÷ {math.exp(min(width, 99.0)):.3g}"
+        return f"± {width:.2g} {self.unit}".rstrip()
 
 
 class Trial(NamedTuple):

@@ -87,6 +87,12 @@ class Replay:
 
         Recordings with fewer than k steps repeat their last tip.
         """
+        return self.carry_out(needles)[:2]
+
+    def carry_out(
+        self, needles: Sequence[Needle], outputs: tuple[str, ...] = ()
+    ) -> tuple[Floats, Flags, Floats]:
+        """Return as `predict`, and the poses (v, n, k, nodes, 5) of needles if outputs has "shapes", else none."""
         states, models = [], []
         zero = (0.0,) * self.axes
         for needle in needles:
@@ -95,10 +101,15 @@ class Replay:
             states += [starts[roll] for roll in rolls]
             models += [needle.model(order) for order in self.order]
         rows = np.tile(self.commands, (len(needles), 1, 1))
-        out = needles[0].simulator.rollout(states, rows, models=models, limits=False)
+        out = needles[0].simulator.rollout(states, rows, models=models, limits=False, outputs=outputs)
         shape = len(needles), len(self.recordings), len(self._ends)
         good = np.logical_and.reduce(np.asarray(out.converged).reshape(*shape[:2], -1), axis=2)
-        return out.tips[:, self._ends].reshape(*shape, 5), good
+        shapes = out.shapes[:, self._ends] if outputs else np.zeros((0, 1, 2, 5))
+        return (
+            out.tips[:, self._ends].reshape(*shape, 5),
+            good,
+            shapes.reshape(-1, *shape[1:], *shapes.shape[-2:]) if outputs else shapes,
+        )
 
     def corrected(self, tips: Floats) -> "Replay":
         """Return the replay with the advances corrected by the depths of the tips (n, k, 5) that it has led to."""

@@ -1,18 +1,23 @@
 """Rehearsals: recordings of a simulated phantom, to try a calibration before a laboratory's own."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flexneedle.errors import InputError
+from flexneedle.lab.calibration.readings import StepReading
 from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.phantom.draw import Truth
+from flexneedle.phantom.phantom import to_poses
 from flexneedle.phantom.plants import ExactPlant, Plant, PlantFactory
-from flexneedle.types import COLUMNS, DB_X, DG_Y, Floats, Pose
+from flexneedle.phantom.tracking.along import VirtualSensor
+from flexneedle.types import COLUMNS, DB_X, DG_Y, Floats, Point, Pose
 
 _ADVANCE_MM, _GUIDE_MM = 1.0, 0.5  # longest motions in a step of the plant
 _STEP_S = 10.0  # between two readings
+_READINGS = 10  # of a sensor along the needle at a step
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +63,7 @@ class SensorErrors:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """A phantom and a sensor, with which insertions are recorded.
+    """A phantom and a sensor, with which insertions are recorded, and the sensors along the needle of its scenario.
 
     Attributes:
         truth: The phantom. Each insertion starts from its start pose, with the bevel towards +y.
@@ -74,12 +79,35 @@ class Rehearsal:
 
     def record(self, schedules: Sequence[Schedule], name: str = "rehearsal") -> Session:
         """Return a session of insertions; the guide moves before the advance to a step."""
-        return Session(
-            tuple(self._record(each, name, f"{k:02}") for k, each in enumerate(schedules)), "before"
-        )
+        begin, poses = -self.truth.scenario.setup.tip_to_skin_mm, list[Floats]()
+        recordings = []
+        for k, schedule in enumerate(schedules):
+            plant, tips = self.plant(self.truth, 0.0), []
+            for _ in rests(plant, schedule, begin):
+                tips.append(plant.tip)
+                if self.truth.scenario.sensor:
+                    poses.append(_poses_of(plant))
+            recordings.append(self._record(np.array(tips), schedule, name, f"{k:02}"))
+        return Session(tuple(self._measure(recordings, Rests(poses))), "before")
 
-    def _record(self, schedule: Schedule, session: str, name: str) -> Recording:
-        tips = carry_out(self.plant(self.truth, 0.0), schedule, -self.truth.scenario.setup.tip_to_skin_mm)
+    def _measure(self, recordings: Sequence[Recording], needles: "Rests") -> Iterator[Recording]:
+        """Yield recordings with the readings of the sensors along the needle, which keep their errors."""
+        scenario, found = self.truth.scenario, list[tuple[int, StepReading]]()
+        for sensor in scenario.sensor:
+            slow = sensor.model_copy(update={"rate_hz": _READINGS / _STEP_S, "delay_s": 0.0})
+            depth, length = scenario.target.depth_mm, scenario.needle.length_mm
+            made = VirtualSensor(slow, needles, scenario.setup.axes, depth, length, self.rng)
+            for each in made.read():
+                step = needles.step(each.time)
+                found += [(step, StepReading(sensor.title, step, each.rows))] if each.rows else []
+        first = 0
+        for one in recordings:
+            last = first + len(one.depth)
+            own = (each._replace(step=step - first) for step, each in found if first <= step < last)
+            yield replace(one, readings=tuple(own))
+            first = last
+
+    def _record(self, tips: Floats, schedule: Schedule, session: str, name: str) -> Recording:
         count, axes = schedule.guide.shape
         axis = np.array([Pose(*tip).axis for tip in tips.tolist()])
         points = tips[:, : 1 + axes] + self.rng.normal(0.0, self.errors.position_mm, (count, 1 + axes))
@@ -97,9 +125,37 @@ class Rehearsal:
         )
 
 
+@dataclass(frozen=True)
+class Rests:
+    """Poses (n, 5) of needles at rest, one after another, as a `MeasuredNeedle`."""
+
+    poses: Sequence[Floats]
+
+    def now(self) -> float:
+        """Return the time (s) of the end."""
+        return _STEP_S * len(self.poses) - 1e-6
+
+    def step(self, time: float) -> int:
+        """Return the number of the needle at a time (s), in whole seconds, as clocks are wrong by less."""
+        return min(int(round(time) // _STEP_S), len(self.poses) - 1)
+
+    def tip_at(self, time: float) -> Point:
+        """Return x, y, z (mm) of the tip."""
+        x, y, z = self.shape_at(time)[0][-1, :3].tolist()
+        return x, y, z
+
+    def shape_at(self, time: float) -> tuple[Floats, float]:
+        """Return the poses (n, 5), and the roll, 0."""
+        return self.poses[self.step(time)], 0.0
+
+
 def carry_out(plant: Plant, schedule: Schedule, start: float) -> Floats:
     """Return the poses (k, 5) of the tip at the steps of a schedule, from a depth (mm) at the start."""
-    tips = []
+    return np.array([plant.tip for _ in rests(plant, schedule, start)])
+
+
+def rests(plant: Plant, schedule: Schedule, start: float) -> Iterator[None]:
+    """Move the needle from a depth (mm) at the start to each step of a schedule, and yield there."""
     advances = np.diff(schedule.depths, prepend=start)
     moves = np.diff(schedule.guide, axis=0, prepend=np.zeros((1, schedule.guide.shape[1])))
     for advance, move in zip(advances.tolist(), moves, strict=True):
@@ -109,8 +165,15 @@ def carry_out(plant: Plant, schedule: Schedule, start: float) -> Floats:
         row = np.zeros(len(COLUMNS))
         row[DB_X] = advance
         _move(plant, row, abs(advance) / _ADVANCE_MM)
-        tips.append(plant.tip)
-    return np.array(tips)
+        yield
+
+
+def _poses_of(plant: Plant) -> Floats:
+    """Return the poses (n, 5) of a needle. Raises InputError for a plant without nodes."""
+    nodes = getattr(plant, "nodes", None)
+    if nodes is None:
+        raise InputError(f"plant = {type(plant).__name__}: without nodes no [[sensor]] can measure it")
+    return to_poses(nodes)
 
 
 def _move(plant: Plant, row: Floats, parts: float) -> None:

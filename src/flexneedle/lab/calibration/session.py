@@ -1,4 +1,7 @@
-"""Recorded insertions in the needle's frame: a table of steps, `steps.parquet`, and their origin, `session.toml`."""
+"""Recorded insertions in the needle's frame: a table of steps, `steps.parquet`, and their origin, `session.toml`.
+
+`readings.parquet` has the readings of sensors along the needle, if there are any.
+"""
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +19,12 @@ import tomli_w
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
+from flexneedle.lab.calibration.readings import (
+    READINGS_FILE,
+    StepReading,
+    from_reading_columns,
+    to_reading_columns,
+)
 from flexneedle.types import Flags, Floats
 
 STEPS_FILE, SESSION_FILE = "steps.parquet", "session.toml"
@@ -43,6 +52,7 @@ class Recording:
         guide: y, z (k, axes) of the guide.
         base: y, z (k, axes) of the base.
         roll: Angle (k,) of the needle.
+        readings: Readings of sensors along the needle.
     """
 
     session: str
@@ -54,6 +64,7 @@ class Recording:
     guide: Floats
     base: Floats
     roll: Floats
+    readings: tuple[StepReading, ...] = ()
 
     @property
     def axes(self) -> int:
@@ -88,7 +99,7 @@ class Recording:
         kept: dict[str, Any] = {
             name: getattr(self, name)[:count] for name in ("time", "depth", "roll", *_NUMBERS)
         }
-        return replace(self, **kept)
+        return replace(self, **kept, readings=tuple(one for one in self.readings if one.step < count))
 
     def __repr__(self) -> str:
         return (
@@ -179,6 +190,13 @@ class Session:
         steps = BytesIO()
         write_table(table(to_columns(self.recordings)), steps)
         replace_file(folder / STEPS_FILE, steps.getvalue())
+        if any(one.readings for one in self.recordings):
+            keys = [(one.session, one.name) for one in self.recordings]
+            rows = to_reading_columns(keys, [one.readings for one in self.recordings])
+            write_table(table(rows), readings := BytesIO())
+            replace_file(folder / READINGS_FILE, readings.getvalue())
+        else:
+            (folder / READINGS_FILE).unlink(missing_ok=True)
         head = {"format": _FORMAT, "axes": self.axes, "guide_order": self.guide_order, "origin": self.origin}
         replace_file(folder / SESSION_FILE, tomli_w.dumps(head).encode())
 
@@ -204,7 +222,26 @@ def load_session(folder: str | Path) -> Session:
         raise InputError(f"{folder}: {STEPS_FILE}: has no column {error}") from None
     except InputError as error:
         raise InputError(f"{folder}: {STEPS_FILE}: {error}") from None
+    recordings = tuple(_with_readings(folder / READINGS_FILE, recordings))
     return Session(recordings, head["guide_order"], head.get("origin", {}))
+
+
+def _with_readings(path: Path, recordings: Sequence[Recording]) -> Iterator[Recording]:
+    """Yield recordings with the readings of sensors along the needle. Raises InputError for a damaged table."""
+    from pyarrow.parquet import read_table
+
+    if not path.exists():
+        yield from recordings
+        return
+    steps = {(one.session, one.name): len(one.depth) for one in recordings}
+    try:
+        columns = {name: column.to_numpy() for name, column in read_columns(read_table(path))}
+        found = from_reading_columns(columns, steps)
+    except KeyError as error:
+        raise InputError(f"{path}: has no column {error}") from None
+    except (OSError, ValueError, TypeError, InputError) as error:  # of Arrow, text for a number
+        raise InputError(f"{path}: {error}") from None
+    yield from (replace(one, readings=found.get((one.session, one.name), ())) for one in recordings)
 
 
 def read_columns(rows: Any) -> Iterator[tuple[str, Any]]:

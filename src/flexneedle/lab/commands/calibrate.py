@@ -90,6 +90,10 @@ def _calibrate(args: argparse.Namespace) -> int:
         print_table("", ("parameter", "value", "95 %"), found.table())
         position, slope = found.final.noise.sd[-2:].tolist()
         print(f"Errors of readings: {position:.2g} mm, {1e3 * slope:.2g} mrad")
+        if rows := found.by_readings():
+            print_table("95 % by the readings of", ("parameter", "tip", "sensors", "both"), rows)
+            for name, (noise, model) in found.final.factors.items():
+                print(f"Errors of {name}: {noise:.2g} times its noise, {model:.2g} times its model error")
         print(f"\nScenario: {args.out}")
     profile = None
     if args.profile is not None:
@@ -130,7 +134,7 @@ def _design(args: argparse.Namespace) -> int:
     print(f"Insertions to {proposals[0].depth:.0f} mm, each with the intervals of 95 % after it")
     for number, each in enumerate(proposals, 1):
         moves = [f"at {depth:.0f} mm guide to {_format_place(place)} mm" for depth, *place in each.moves]
-        widths = [parameter.format_width(width) for parameter, width in each.widths]
+        widths = [f"{parameter.label} {parameter.format_width(width)}" for parameter, width in each.widths]
         print(f"\nInsertion {number}", *(moves or ["guide at rest"]), *widths, sep="\n  ")
     return 0
 

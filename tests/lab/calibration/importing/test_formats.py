@@ -4,17 +4,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import StoragePlugin
 from scipy.io import savemat
 
 from flexneedle.errors import InputError
 from flexneedle.lab.calibration.importing.columns import to_seconds
+from recorded_bags import header, message, point, turn, write_bag
 from recorded_insertions import PLAIN, assert_steps, columns, guided, load, write_csv
 
 PATH = guided()
 TABLE = columns(PATH)
-STORE = get_typestore(Stores.ROS2_JAZZY)
 POSE = {
     "tip": {"position": [f"/tip.pose.position.{axis}" for axis in "xyz"], "unit": "m",
             "quaternion": [f"/tip.pose.orientation.{axis}" for axis in "xyzw"], "sensor_axis": "x"},
@@ -155,38 +154,6 @@ def test_matlab_struct_arrays_are_insertions(tmp_path):
     assert [one.name for one in found] == ["1", "2"]
     for one, path in zip(found, paths, strict=True):
         assert_steps(one, path)
-
-
-def message(kind, **fields):
-    return STORE.types[kind](**fields)
-
-
-def header(seconds, frame="tracker"):
-    stamp = message("builtin_interfaces/msg/Time", sec=int(seconds), nanosec=0)
-    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-
-def point(values):
-    return message("geometry_msgs/msg/Point", **dict(zip("xyz", values, strict=True)))
-
-
-def turn(axis):
-    """Return the quaternion that turns x into an axis by the shortest way."""
-    quaternion = np.array([0.0, -axis[2], axis[1], 1.0 + axis[0]])
-    values = quaternion / np.linalg.norm(quaternion)
-    return message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
-
-
-def write_bag(folder, storage, topics):
-    """Write messages (time in s, topic, message) as a bag."""
-    with Writer(folder, version=9, storage_plugin=storage) as writer:
-        known = {}
-        for seconds, topic, each in topics:
-            kind = each.__msgtype__
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(known[topic], int(1e9 * seconds), STORE.serialize_cdr(each, kind))
-    return folder
 
 
 def poses():

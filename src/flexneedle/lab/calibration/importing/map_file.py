@@ -216,6 +216,62 @@ class StepMap(Section):
         return self
 
 
+class SensorMap(Section):
+    """One `[[sensor]]`: readings of a sensor along the needle, in the same file as the tip or in a table beside it."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """Name of the sensor in the scenario: its `name`, or its `kind`."""
+    file: str = "{name}{suffix}"
+    """Its table, relative to the tip's file, whose name without and with its suffix replace `{name}` and `{suffix}`:
+    "{name}_fbg.csv" or "fbg/{name}.csv". Not set: the tip's file."""
+    time: TimeMap | None = None
+    """Time of a reading, on the clock of the tip. Not set: columns and units of `[time]`."""
+    curvature: Columns = ()
+    """Columns of the curvature towards y of each site, from the tip on; in space of y, then z at each site. Axes: the
+    needle's frame where the roll is 0."""
+    curvature_unit: Literal["1/m", "1/mm"] = "1/m"
+    """Unit of the curvatures."""
+    position: Columns = ()
+    """Instead of curvatures: columns x, y, z of a point on the axes of the tracker, or of several points in a row. Rows
+    with the same time are one reading."""
+    unit: LengthUnit = "mm"
+    """Unit of the positions."""
+    pixels: Columns = ()
+    """Instead of curvatures: column and row of a point in an image, or of several. Rows with the same time are one
+    reading."""
+    within_s: Positive = 0.5
+    """Longest time from the time of a step to a reading that counts for it; the needle must be at rest."""
+
+    @model_validator(mode="after")
+    def _check_values(self) -> Self:
+        given = [key for key in ("curvature", "position", "pixels") if getattr(self, key)]
+        if len(given) != 1:
+            refuse([Problem((), None, "must have one of curvature, position and pixels")])
+        size = {"curvature": 1, "position": 3, "pixels": 2}[given[0]]
+        if len(self.values) % size:
+            refuse([Problem(given[0], self.values, f"must be {size} columns for each point")])
+        return self
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Columns of the values."""
+        return self.curvature or self.position or self.pixels
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the columns of numbers, without their signs."""
+        return tuple(dict.fromkeys(map(to_name, self.values)))
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """Names of the columns of text: none."""
+        return ()
+
+    def path(self, tip: Path) -> Path:
+        """Return the file of the sensor for the tip's file."""
+        return tip.parent / self.file.replace("{name}", tip.stem).replace("{suffix}", tip.suffix)
+
+
 class RecordingMap(Section):
     """A map of recordings."""
 
@@ -227,6 +283,7 @@ class RecordingMap(Section):
     roll: RollMap | None = None
     frame: FrameMap = FrameMap()
     steps: StepMap = StepMap()
+    sensor: Annotated[tuple[SensorMap, ...], Field(strict=False)] = ()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -244,8 +301,17 @@ class RecordingMap(Section):
             problems.append(
                 Problem("frame", None, "x and y must be the axes x and y, as tip.position has two columns")
             )
+        problems += self._check_sensors()
         refuse(problems)
         return self
+
+    def _check_sensors(self) -> Iterator[Problem]:
+        names = [each.name for each in self.sensor]
+        for n, each in enumerate(self.sensor):
+            if each.name in names[:n]:
+                yield Problem(("sensor", n, "name"), each.name, "another sensor has this name")
+            if len(each.curvature) % self.axes:
+                yield Problem(("sensor", n, "curvature"), each.curvature, "must be y and z of each site")
 
     @property
     def axes(self) -> int:

@@ -15,7 +15,9 @@ from flexneedle.lab.calibration.importing.frames import (
 )
 from flexneedle.lab.calibration.importing.map_file import FIT, RecordingMap, StageMap
 from flexneedle.lab.calibration.importing.rows import Rows, read_rows
+from flexneedle.lab.calibration.importing.sensor_tables import in_needle_frame
 from flexneedle.lab.calibration.importing.steps import before_retreat, find_steps, in_order
+from flexneedle.lab.calibration.readings import StepReading
 from flexneedle.lab.calibration.session import Recording
 from flexneedle.types import Floats
 
@@ -95,7 +97,7 @@ def _in_frame(
         for one, _ in made
         if _is_short(one)
     ]
-    notes = [note for _, note in made if note]
+    notes = [note for _, own in made for note in own]
     return frame, [one for one, _ in made if not _is_short(one)], [*notes, *short]
 
 
@@ -103,8 +105,8 @@ def _is_short(one: Recording) -> bool:
     return len(one.depth) < LEAST_STEPS
 
 
-def _recording(rows: Rows, frame: Rigid, recording_map: RecordingMap) -> tuple[Recording, str]:
-    """Return the steps of an insertion in a frame up to its deepest one, and a note on later ones."""
+def _recording(rows: Rows, frame: Rigid, recording_map: RecordingMap) -> tuple[Recording, list[str]]:
+    """Return the steps of an insertion in a frame up to its deepest one, and notes on later ones and on sensors."""
     given, axes = recording_map.frame, recording_map.axes
     position = frame.apply(rows.position)
     skin = position[0, 0] - given.first_depth_mm if given.skin_mm is None else given.skin_mm
@@ -125,10 +127,39 @@ def _recording(rows: Rows, frame: Rigid, recording_map: RecordingMap) -> tuple[R
         )
     ]
     slope = _slopes(rows, frame, position)[:, :axes]
+    origin = np.array([skin, *position[0, 1:]])
+    readings, unread = _read_steps(rows, frame, origin, recording_map)
     made = Recording(
-        rows.session, rows.name, rows.time, depth, lateral[0], slope, lateral[1], lateral[2], rows.roll
+        rows.session,
+        rows.name,
+        rows.time,
+        depth,
+        lateral[0],
+        slope,
+        lateral[1],
+        lateral[2],
+        rows.roll,
+        readings,
     )
-    return made, note
+    return made, [*([note] if note else []), *unread]
+
+
+def _read_steps(
+    rows: Rows, frame: Rigid, origin: Floats, recording_map: RecordingMap
+) -> tuple[tuple[StepReading, ...], list[str]]:
+    """Return the readings of sensors along the needle at the steps, and a note on sensors without one."""
+    if rows.sensors and not np.isfinite(rows.time).all():
+        raise InputError(f"{rows.source}: readings of a sensor need the time of each step: set time.columns")
+    found, notes = list[StepReading](), list[str]()
+    for table, given in zip(rows.sensors, recording_map.sensor, strict=True):
+        own = [*in_needle_frame(table, given, frame, origin).at_steps(rows.time)]
+        found += own
+        if not own:
+            notes.append(
+                f"{rows.source}: no reading of {given.name} within {given.within_s:g} s of a step: check its "
+                "time, or set within_s"
+            )
+    return tuple(found), notes
 
 
 def _stage(moved: Floats, given: StageMap | None, frame: Rigid) -> Floats:

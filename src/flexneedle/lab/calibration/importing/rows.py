@@ -11,7 +11,9 @@ from flexneedle.errors import InputError
 from flexneedle.lab.calibration.importing.bags import TIME
 from flexneedle.lab.calibration.importing.columns import Table
 from flexneedle.lab.calibration.importing.map_file import ANGLES, LENGTHS, RecordingMap, StageMap, to_name
+from flexneedle.lab.calibration.importing.sensor_tables import read_sensors
 from flexneedle.lab.calibration.importing.tables import read_table
+from flexneedle.lab.calibration.readings import SensorTable
 from flexneedle.types import Floats
 
 UNIT_LENGTH = 0.02
@@ -33,6 +35,7 @@ class Rows:
         guide: Position (r, 3) of the guide, mm, in the axes of the tracker or the needle's frame, as mapped.
         base: Position (r, 3) of the base.
         roll: Angle (r,) of the needle, rad.
+        sensors: Readings of sensors along the needle in the file.
     """
 
     source: str
@@ -45,6 +48,7 @@ class Rows:
     guide: Floats
     base: Floats
     roll: Floats
+    sensors: tuple[SensorTable, ...] = ()
 
     @property
     def table(self) -> Floats:
@@ -86,7 +90,8 @@ def read_rows(path: Path, session: str, recording_map: RecordingMap) -> Iterator
     if not kept.any():
         raise InputError(f"{path}: no row has {' and '.join(f'{k} = {v!r}' for k, v in table.where.items())}")
     labels = [_labels(columns, names, kept) for names in (table.session, table.insertion)]
-    rows = replace(whole.choose(kept), session=session, name=path.stem, source=str(path))
+    sensors = read_sensors(path, recording_map)
+    rows = replace(whole.choose(kept), session=session, name=path.stem, source=str(path), sensors=sensors)
     yield from _divide(rows, *labels)
 
 

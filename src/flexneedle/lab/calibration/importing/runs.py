@@ -7,6 +7,7 @@ import numpy as np
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.calibration.importing.recordings import LEAST_STEPS, Found
+from flexneedle.lab.calibration.readings import SensorTable, StepReading
 from flexneedle.lab.calibration.session import GuideOrder, Recording
 from flexneedle.record.folder import RUN_FILE, TRACE_FILE
 from flexneedle.record.loading import load_insertion
@@ -56,6 +57,7 @@ def _read_run(folder: Path, session: str) -> tuple[Recording, tuple[str, ...]]:
         lateral[1],
         lateral[2],
         moved[:, 4],
+        tuple(_sensor_readings(done, time[:, 0])),
     )
     return recording, tuple(f"{folder}: {each}" for each in _notes(done, note))
 
@@ -79,6 +81,15 @@ def _readings(done: Insertion, axes: int) -> Floats:
                 *(value.direction or (np.nan, np.nan)),
             )
     return np.array(sorted(found.values())).reshape(-1, 6)
+
+
+def _sensor_readings(done: Insertion, times: Floats) -> Iterator[StepReading]:
+    """Yield readings of sensors along the needle that corrected the model, at the nearest of the steps' times (k,)."""
+    within = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    for state in (state for period in done.periods for state in period.sensors):
+        at = np.array([one.time for one in state.good])
+        table = SensorTable(state.name, at, tuple(one.rows for one in state.good), within)
+        yield from table.at_steps(times)
 
 
 def _times(done: Insertion) -> Floats:

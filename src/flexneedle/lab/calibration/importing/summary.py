@@ -32,6 +32,9 @@ def summarize(session: Session, found: Found) -> Iterator[str]:
         ]
         yield f"the {name} moves in {_count(moves, _STILL_MM, 'mm')}"
     yield f"the needle is rotated in {_count([float(np.ptp(one.roll)) for one in recordings], _STILL_RAD, 'rad')}"
+    for sensor in dict.fromkeys(each.sensor for one in recordings for each in one.readings):
+        steps = [len({each.step for each in one.readings if each.sensor == sensor}) for one in recordings]
+        yield f"readings of {sensor} at {sum(steps)} steps in {sum(map(bool, steps))} of {len(steps)} insertions"
     for name, frame in found.frames.items():
         rows = zip("xyz", frame.rotation.round(3).tolist(), strict=True)
         shown = ", ".join(f"{axis} = {row}" for axis, row in rows)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -10,13 +10,37 @@ from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError, one_line
 from flexneedle.lab.calibration.importing.bags import TIME, find_bag, read_bag
 from flexneedle.lab.calibration.importing.columns import Table, locate, to_numbers, to_seconds
-from flexneedle.lab.calibration.importing.map_file import TIMES, RecordingMap, to_name
+from flexneedle.lab.calibration.importing.map_file import TIMES, TableMap, TimeMap, to_name
 from flexneedle.lab.calibration.importing.text_tables import read_text
 
 _PARQUET, _MAT, _HDF = b"PAR1", b"MATLAB 5.0 MAT-file", b"\x89HDF"
 
 
-def read_table(path: Path, recording_map: RecordingMap) -> Table:
+class Columns(Protocol):
+    """The columns of a table: a `RecordingMap`, or a sensor's."""
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the columns of numbers."""
+        ...
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """Names of the columns of text."""
+        ...
+
+    @property
+    def time(self) -> TimeMap:
+        """Columns of the time."""
+        ...
+
+    @property
+    def table(self) -> TableMap:
+        """Layout of the file."""
+        ...
+
+
+def read_table(path: Path, recording_map: Columns) -> Table:
     """Return the columns of a map: numbers, text, and `TIME` in s if the file has times.
 
     CSV and other text, Parquet, MATLAB, MCAP or rosbag2; the content of the file decides, not its name. Raises
@@ -30,7 +54,7 @@ def read_table(path: Path, recording_map: RecordingMap) -> Table:
         raise InputError(f"{path}: {one_line(error)}") from None
 
 
-def _read(path: Path, recording_map: RecordingMap) -> Table:
+def _read(path: Path, recording_map: Columns) -> Table:
     times = tuple(map(to_name, recording_map.time.columns))
     names = dict.fromkeys((*recording_map.numbers, *times, *recording_map.text))
     if (bag := find_bag(path)) is not None:
@@ -48,7 +72,7 @@ def _read(path: Path, recording_map: RecordingMap) -> Table:
     return read_text(path, recording_map.numbers, times, recording_map.text, recording_map.table)
 
 
-def _convert(columns: Table, recording_map: RecordingMap) -> Iterator[tuple[str, Any]]:
+def _convert(columns: Table, recording_map: Columns) -> Iterator[tuple[str, Any]]:
     time = recording_map.time
     for name in recording_map.text:
         yield name, np.array(["" if each is None else str(each).strip() for each in columns[name].tolist()])
