@@ -105,6 +105,14 @@ def test_in_a_distorted_field_a_fibre_leads_to_the_target():
     assert inserted(**changes).outcome == "held"
 
 
+def test_the_needle_is_held_where_no_sensor_measures_it():
+    silent = {**FBG, "phantom": {"fault": {"kind": "lost", "depth_mm": 14.0}}}
+    insertion = inserted(silent, phantom__tracker_lost_mm=10.0)
+    assert insertion.outcome == "held"
+    assert "no good reading of any sensor" in insertion.reason
+    assert insertion.periods[-1].true_tip.x < 14.0 + 3.0
+
+
 def test_healthy_sensors_are_not_excluded():
     insertion = inserted(FBG, *SLICES)
     assert insertion.outcome == "done"

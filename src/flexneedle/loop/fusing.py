@@ -90,7 +90,7 @@ def _read_sensor(
     # Where most are outliers, they are no chance: the sensor is faulty, or the prediction is wrong.
     judged = good | outlying if outlying.sum() > _OUTLYING * (good | outlying).sum() else good
     nis = compared.nis(judged) if judged.any() else math.nan
-    monitor = monitor.innovate(nis)
+    monitor = monitor.innovate(nis).hear(one.reading.time for one in checked if one.verdict.ok)
     if monitor.excluded.ok:
         frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
         monitor = replace(monitor, excluded=frozen)
@@ -169,6 +169,19 @@ def set_field(scenario: Scenario, estimate: Any, monitor: Monitor, since: float)
     settings, largest, least = scenario.monitor, monitor.largest_indicator(), scenario.tracker.field_sd_mm
     sd = settings.error_per_indicator_mm * largest / math.sqrt(3.0)
     return estimate.with_field(max(least, sd) if largest > settings.indicator_limit else least, since)
+
+
+def check_silent(scenario: Scenario, watch: Watch, now: float) -> Verdict:
+    """Require a good reading of some sensor that is not excluded: never move on predictions alone; now (s)."""
+    limits = {one.title: one.delay_s + 1.0 / one.rate_hz for one in scenario.sensor} | {TRACKER: 0.0}
+    ages = {
+        name: now - watch.of(name).heard - more for name, more in limits.items() if watch.of(name).excluded.ok
+    }
+    least = min(ages.values(), default=math.inf)
+    if least <= scenario.control.stale_after_s:
+        return OK
+    reason = f"no good reading of any sensor for {least:.2f} s, limit {scenario.control.stale_after_s:.2f} s"
+    return Verdict(VerdictKind.MISSING, reason)
 
 
 def check_uncertain(

@@ -9,6 +9,7 @@ from flexneedle.estimation.fitted import TRACKER
 from flexneedle.loop.fusing import (
     NO_WATCH,
     Watch,
+    check_silent,
     check_uncertain,
     exclude_faulty,
     read_sensors,
@@ -110,9 +111,13 @@ def observe_all(
         return replace(found, watch=watch, sensors=sensors)
     trusted = watch.of(TRACKER).excluded.ok
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
+    heard = (one.measurement.time for one in found.readings if one.verdict.ok)
+    watch = watch.change(TRACKER, watch.of(TRACKER).hear(heard))
     estimate, watch, sensors, verdict = exclude_faulty(scenario, found.estimate, watch, sensors, before.watch)
     if not trusted:
         verdict = watch.of(TRACKER).excluded
+    if verdict.ok:
+        verdict = check_silent(scenario, watch, now)
     if verdict.ok:
         tracker = found.verdict if scenario.tracker.enabled else Verdict(VerdictKind.MISSING, "there is none")
         verdict = check_uncertain(scenario, estimate, sensors, str(tracker))

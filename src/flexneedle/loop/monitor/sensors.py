@@ -5,7 +5,7 @@ that contradicts the others is found by the fit (`flexneedle.loop.fusing`).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -25,7 +25,8 @@ class SensorMonitor:
     """State of the monitor of one sensor. Frozen: each method returns the next state.
 
     newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them;
-    nis: normalised squares of the innovations of the last periods; excluded: why the sensor does not count any more.
+    nis: normalised squares of the innovations of the last periods; excluded: why the sensor does not count any more;
+    heard: time (s) of the last good reading, 0 before the first.
     """
 
     newest: Reading | None = None
@@ -33,6 +34,11 @@ class SensorMonitor:
     since: float = 0.0
     nis: tuple[float, ...] = ()
     excluded: Verdict = OK
+    heard: float = 0.0
+
+    def hear(self, times: Iterable[float]) -> "SensorMonitor":
+        """Return the state with the times (s) of good readings."""
+        return replace(self, heard=max([self.heard, *times]))
 
     def innovate(self, nis: float) -> "SensorMonitor":
         """Return the state with the innovation of a period; NaN is none."""
