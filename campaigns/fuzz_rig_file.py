@@ -268,7 +268,8 @@ def _read_settings(rig: RigFile) -> None:
 
 def read_profile(path: Path) -> str:
     """Read a profile; return what is wrong with it, or ""."""
-    names = [topic.topic for _, topic in load_profile(path).list_topics()]
+    profile = load_profile(path)
+    names = [topic.topic for key, topic in profile.list_topics() if not key.startswith("sensors.")]
     return "" if len(names) == len({*names}) else "a topic twice"
 
 
