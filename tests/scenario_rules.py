@@ -51,7 +51,7 @@ NOT_NEGATIVE += _keys("""
     entry: free_radius_mm free_slope_mrad
     guard: zone_buffer_mm
     image: sd_mm
-    monitor: error_per_indicator_mm jump_margin_mm lost_after_s
+    monitor: indicator_error_mm jump_margin_mm lost_after_s
     needle: inner_diameter_mm
     needle.bevel: offset_mm
     phantom: shear_modulus_variation layer_shift_sd_mm start_offset_sd_mm start_angle_sd_mrad start_offset_z_sd_mm

@@ -167,7 +167,7 @@ def set_field(scenario: Scenario, estimate: Any, monitor: Monitor, since: float)
     In a clean field it is the scenario's.
     """
     settings, largest, least = scenario.monitor, monitor.largest_indicator(), scenario.tracker.field_sd_mm
-    sd = settings.error_per_indicator_mm * largest / math.sqrt(3.0)
+    sd = settings.indicator_error_mm * largest / math.sqrt(3.0)
     return estimate.with_field(max(least, sd) if largest > settings.indicator_limit else least, since)
 
 

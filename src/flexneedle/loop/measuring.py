@@ -151,7 +151,7 @@ def observe(
     monitor, readings = _check_readings(scenario, predicted, monitor, measurements, max_ages, now)
     newest = readings[-1]
     monitor, field = monitor.check_field()
-    fused = bool(sensors) and can_fuse(predicted) and scenario.monitor.error_per_indicator_mm > 0.0
+    fused = bool(sensors) and can_fuse(predicted) and scenario.monitor.indicator_error_mm > 0.0
     if fused:
         predicted = set_field(scenario, predicted, monitor, begun)
     if not (field.ok or (fused and field.kind is VerdictKind.FIELD_DISTORTED)):

@@ -21,7 +21,7 @@ class MonitorSettings(Section):
     """Window of a shorter median; while this is above the limit, no reading corrects the model."""
     resume_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Share of the limit below which all indicators must fall before a held needle continues."""
-    error_per_indicator_mm: NonNegative = 9.6
+    indicator_error_mm: NonNegative = 9.6
     """Error of the tracker per unit of the largest indicator, in a field that is not clean. With a `[[sensor]]` its
     readings are used with this error, not rejected. 0: rejected. In the paper 9.591."""
     abort_after_s: Positive = 10.0
