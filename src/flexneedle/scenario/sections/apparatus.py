@@ -227,7 +227,7 @@ class TrackerSettings(Section):
     jitter_mm: NonNegative = 0.07
     """RMS length of the 3D deviation of a reading from the mean. `environment` replaces it."""
     enabled: bool = True
-    """Whether there is a tracker. Without one the scenario needs a `[[sensor]]`, and the depth is the motors'."""
+    """False: there is no tracker. Without one the scenario needs a `[[sensor]]`, and the depth is the motors'."""
     bias_sd_mm: NonNegative = 0.0
     """Prior standard deviation, on each axis, of a constant error of the tracker, which `adaptive-mpc` estimates."""
     field_sd_mm: NonNegative = 0.0

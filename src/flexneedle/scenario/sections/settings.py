@@ -96,7 +96,7 @@ class ControlSettings(Section):
     load_gain: Fraction = 0.3
     """Gain per period of the low-pass filter on the estimated tip load. Not used by `adaptive-mpc`."""
     essential_points: bool = False
-    """Whether points of sensors `points` and `slice` in the tissue are essential conditions, as the measured tip is in
+    """True: points of sensors `points` and `slice` in the tissue are essential conditions, as the measured tip is in
     the paper. Not used by `adaptive-mpc`, which fits all sensors."""
     depth_tolerance_mm: Positive = 0.01
     """Distance from the target depth at which the insertion ends."""

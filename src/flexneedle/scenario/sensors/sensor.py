@@ -66,9 +66,9 @@ class Sensor(Section):
     """
 
     paired: ClassVar[bool] = False
-    """Whether values are lateral quantities: y in the plane, in space y and z, one after the other, as a vector."""
+    """True: values are lateral quantities: y in the plane, in space y and z, one after the other, as a vector."""
     rolls: ClassVar[bool] = False
-    """Whether the sensor is in the needle and rolls with it. Its values are `paired`."""
+    """True: the sensor is in the needle and rolls with it. Its values are `paired`."""
 
     kind: str
     """`fbg`, `slice`, `points`, `view` or `module:NAME`."""

@@ -220,12 +220,12 @@ class _SensorCheck:
             "rate", rate, 0.0, "Hz", f"{sensor.rate_hz:g} Hz", "", "scenario" if line else "", line
         )
         lost = float(np.mean([one.status != VISIBLE for one in self._readings]))
-        told = sensor.phantom.missing_fraction
-        line = f"phantom.missing_fraction = {lost:.2g}" if lost > max(_LOST, 2.0 * told) else ""
+        expected = sensor.phantom.missing_fraction
+        line = f"phantom.missing_fraction = {lost:.2g}" if lost > max(_LOST, 2.0 * expected) else ""
         finite = np.isfinite(self._one.value)
         outlying = 1.0 - self._fit.used[self._number].sum() / finite.sum()
         note = f"{100.0 * outlying:.2g} % of the values are outliers"
-        shown = f"{100.0 * told:.3g} %"
+        shown = f"{100.0 * expected:.3g} %"
         yield self._error("lost", 100.0 * lost, 0.0, "%", shown, note, "scenario" if line else "", line)
 
 

@@ -24,7 +24,7 @@ class MountingSettings(Section):
     turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Angle to add to the directions of bending so that they count from y towards z."""
     mirrored: bool = False
-    """Whether the directions of the device count the other way, from z towards y."""
+    """True: the directions of the device count the other way, from z towards y."""
     offsets_deg: Annotated[tuple[float, ...], Field(strict=False, max_length=1000)] = ()
     """Angle of each grating, to be added like `turn_deg`, in the order of the device. Not set: 0."""
     gain: Positive = 1.0
