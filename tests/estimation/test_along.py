@@ -1,45 +1,11 @@
 """Sensors along the needle in the fit: derivatives by finite differences, and linear problems with known answers."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 
-import flexneedle
 from flexneedle.estimation.along import between, whiten
 from flexneedle.estimation.fit import differentiate, simulate_due
-from flexneedle.estimation.fitted import TRACKER, Part
-from flexneedle.estimation.identification import Identification
-from flexneedle.loop.virtual import Seeds, virtual_rig
-from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Control
-from tasks import begun_with
-
-FBG = {"kind": "fbg", "sites_mm": [11, 26, 70, 105], "delay_sd_s": 0.05}
-SLICE = {"kind": "slice", "plane_mm": 12.0, "normal": [1.0, 0.2, -0.1], "delay_sd_s": 0.05}
-POINTS = {"kind": "points", "from_mm": -15.0, "to_mm": 30.0, "rate_hz": 10.0}
-ROLLS = {14: 0.7, 34: -1.9}
-
-
-def command(k):
-    """An advance with a moving guide, and rolls by odd angles."""
-    return Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), dg_z=0.08 * np.cos(0.2 * k), roll=ROLLS.get(k, 0.0))
-
-
-@cache
-def followed(axes=2, count=50, **changes):
-    """An estimate that has followed a virtual needle with three sensors besides the tracker, and the rig."""
-    name = {1: "phantom", 2: "phantom3d"}[axes]
-    scenario = flexneedle.load_scenario(name).with_values({"sensor": [FBG, SLICE, POINTS], **changes})
-    rig = virtual_rig(scenario, 0.0, Seeds.of(2))
-    estimate = Identification().begin(begun_with(Simulator(scenario, threads=1)))
-    for k in range(count):
-        row = command(k) if axes == 2 else Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), flip=k in ROLLS)
-        estimate = estimate.move(rig.driver.apply(row, 0.2))
-        along = {name: one.read() for name, one in rig.sensors.items()}
-        good = {name: [one for one in readings if one.rows] for name, readings in along.items()}
-        estimate = estimate.observe([one for one in rig.tracker.read() if one.x is not None], good)
-    return estimate, rig
+from sensed import followed
 
 
 def expected(estimate, number):
@@ -144,28 +110,3 @@ def test_readings_are_averaged_over_the_moves_in_which_they_were_taken():
     np.testing.assert_allclose(
         between(bins, np.arange(len(line.begun) + 1.0)[:, None])[:, 0], bins.index + bins.part
     )
-
-
-def test_the_conflict_of_linear_sensors_is_the_cost_of_their_fit_beyond_those_of_each():
-    """Against least squares on all rows at once."""
-    estimate, _ = followed()
-    size, rng = estimate.parameters.size, np.random.default_rng(4)
-    prior, off = estimate.prior.precision, estimate.parameters - estimate.prior.mean
-    parts, problems = [], {}
-    for name, rows in ((TRACKER, 40), ("fbg", 90)):
-        matrix, left = rng.normal(size=(rows, size)), rng.normal(size=rows)
-        parts.append(Part(name, 0.5 * left @ left, rows, matrix.T @ left, matrix.T @ matrix, 1.0))
-        problems[name] = matrix, left
-
-    def cost(names):
-        matrix = np.concatenate([problems[name][0] for name in names])
-        left = np.concatenate([problems[name][1] for name in names])
-        step = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ left - prior @ off)
-        rest, there = left - matrix @ step, off + step
-        return 0.5 * rest @ rest + 0.5 * there @ prior @ there
-
-    both = estimate.change(parts=tuple(parts))
-    conflict = cost([TRACKER, "fbg"]) - cost([TRACKER]) - cost(["fbg"])
-    assert both.conflict("fbg") == pytest.approx(conflict, rel=1e-6)
-    assert both.conflict(TRACKER) == pytest.approx(conflict, rel=1e-6)
-    assert both.misfit("fbg") == pytest.approx(cost([TRACKER]) / 40.0, rel=1e-6)

@@ -8,7 +8,8 @@ import pytest
 
 import flexneedle
 from flexneedle.estimation.along import Comparison
-from flexneedle.loop.fusing import judge_conflict
+from flexneedle.estimation.faults import Fault
+from flexneedle.loop.fusing import judge_faults
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.types import Reading, VerdictKind
@@ -113,6 +114,21 @@ def test_the_needle_is_held_where_no_sensor_measures_it():
     assert insertion.periods[-1].true_tip.x < 14.0 + 3.0
 
 
+def test_images_that_the_needle_has_not_come_to_yet_are_no_loss():
+    insertion = inserted(*SLICES, phantom__tracker_lost_mm=8.0)
+    assert insertion.outcome == "done"
+    assert off(insertion) < 0.5
+
+
+def test_a_sensor_that_jumps_is_excluded():
+    """Its readings are outliers at first."""
+    jump = {"kind": "drift", "depth_mm": 12.0, "size": 40.0}
+    insertion = inserted({**FBG, "phantom": {"fault": jump}})
+    depth, _ = excluded(insertion, "fbg")
+    assert 12.0 < depth < 24.0
+    assert (insertion.outcome, off(insertion) < 0.1) == ("done", True)
+
+
 def test_healthy_sensors_are_not_excluded():
     insertion = inserted(FBG, *SLICES)
     assert insertion.outcome == "done"
@@ -145,19 +161,22 @@ def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("conflict", "misfits", "faulty", "held"),
+    ("odds", "faulty", "held"),
     [
-        (5.0, {"tracker": 2.0, "fbg": 0.1}, "", False),
-        (7.0, {"tracker": 0.5, "fbg": 0.1}, "fbg", False),
-        (7.0, {"tracker": 0.2, "fbg": 0.1}, "", False),  # not clear yet
-        (13.0, {"tracker": 0.2, "fbg": 0.1}, "fbg", False),
-        (13.0, {"tracker": 0.12, "fbg": 0.1}, "", True),
-        (7.0, {"tracker": 0.1, "fbg": 0.12}, "tracker", True),
-        (7.0, {"tracker": 0.9, "a": 0.8, "b": 0.1}, "b", False),
+        ({"tracker": 2.0, "fbg": 6.0}, "", False),
+        ({"tracker": 2.0, "fbg": 8.0}, "fbg", False),
+        ({"tracker": 9.0, "fbg": 13.0}, "fbg", False),
+        ({"tracker": 4.0, "fbg": 7.5}, "fbg", False),
+        ({"tracker": 4.0, "fbg": 6.0}, "", True),  # one of them
+        ({"tracker": 4.0, "fbg": 0.5}, "tracker", True),
+        ({"tracker": 1.0, "a": 2.0, "b": 9.0}, "b", False),
+        ({"tracker": 8.0}, "tracker", True),
+        ({"fbg": 9.0}, "fbg", False),
+        ({}, "", False),
     ],
 )
-def test_the_faulty_sensor_is_the_one_without_which_the_others_agree(conflict, misfits, faulty, held):
-    found, verdict = judge_conflict(dict.fromkeys(misfits, conflict), misfits)
+def test_the_faulty_sensor_is_the_one_whose_fault_is_likeliest(odds, faulty, held):
+    found, verdict = judge_faults({name: Fault(one, 0.0) for name, one in odds.items()})
     assert found == faulty
     assert (not verdict.ok) == bool(faulty or held)
 
@@ -173,10 +192,24 @@ def test_readings_are_checked_one_by_one():
     ]
     values = np.array([[1.0, 0.0], [9.0, 0.0], [np.nan, np.nan], [1.0, 0.0], [1.0, 0.0]])
     compared = Comparison(values, values - [1.0, 0.0], 0.5 * np.eye(2), 0.5)
-    kinds = [one.verdict.kind.value for one in check_readings(readings, compared, 1.1, 0.3)]
+    _, checked = check_readings(SensorMonitor(), readings, compared, 1.1, 0.3)
+    kinds = [one.verdict.kind.value for one in checked]
     assert kinds == ["ok", "outlier", "missing", "stale", "not a number"]
     mean = compared.nis(np.array([True, False, False, True, False]))
     assert mean == pytest.approx(0.0)
+
+
+def test_outliers_one_after_another_are_no_chance():
+    readings = [Reading(1.0, ((9.0,),))] * 9
+    values = np.full((9, 1), 9.0)
+    state, checked = check_readings(
+        SensorMonitor(), readings, Comparison(values, values, np.eye(1), 0.5), 1.1, 0.3
+    )
+    assert [one.verdict.ok for one in checked] == [False] * 6 + [True] * 3
+    state, _ = check_readings(
+        state, readings[:1], Comparison(values[:1], 0.0 * values[:1], np.eye(1), 0.5), 1.1, 0.3
+    )
+    assert state.outliers == 0
 
 
 def test_the_normalised_square_is_one_on_average():

@@ -12,14 +12,11 @@ import numpy as np
 
 from flexneedle.estimation.along import Bins, SensorFit, whiten
 from flexneedle.estimation.fitted import (
-    TRACKER,
     Fitted,
     FittedInsertion,
-    Part,
     Perturbed,
     Simulated,
     adapt_models,
-    kept_share,
 )
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
@@ -55,21 +52,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     gradient = (weighted @ left).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
     if fitted.along:
-        own = float(0.5 * (np.abs(left) ** 2 / variance).sum())
-        known = fitted.sensors[0].unexplained(fitted.nominal.scenario, fitted.settings) ** 2
-        model = np.full_like(variance, known)
-        tip = Part(
-            TRACKER,
-            own,
-            fitted.axes * len(left),
-            (weighted @ left).real,
-            precision - prior.precision,
-            kept_share(variance - model, model),
-        )
-        parts = (tip, *inform_along(fitted))
-        gradient = gradient + sum(one.gradient for one in parts[1:])
-        precision = precision + sum(one.precision for one in parts[1:])
-        fitted = fitted.change(parts=parts)
+        gradient, precision = inform_along(fitted, gradient, precision)
     fitted = fitted.change(precision=precision)
     goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
 
@@ -152,15 +135,8 @@ class Whitening(NamedTuple):
     @staticmethod
     def of(fitted: FittedInsertion, variance: Floats) -> "Whitening":
         """Return the whitening of rows with variances (r,)."""
-        position = fitted.readings[0]
-        path = np.cumsum(np.append(0.0, np.abs(fitted.rows[:, DB_X])))
-        length = fitted.nominal.scenario.tracker.field_length_mm
-        count, place = len(position.index), position.between(path) / length
-        since, sds = np.array(fitted.fields).T
-        begun = fitted.timeline.begun[position.index]
-        sd = sds[np.clip(np.searchsorted(since, begun, side="right") - 1, 0, None)]
-        correlated = np.multiply.outer(sd, sd) * np.exp(-np.abs(place[:, None] - place))
-        covariance = np.diag(variance[:count]) + correlated
+        covariance = field_covariance(fitted)
+        covariance += np.diag(variance[: len(covariance)])
         return Whitening(np.linalg.cholesky(covariance).astype(np.float64), variance)
 
     def of_rows(self, rows: Laterals) -> Laterals:
@@ -170,23 +146,30 @@ class Whitening(NamedTuple):
         return np.concatenate([np.linalg.solve(self.lower, rows[:count]), rest])
 
 
-def inform_along(fitted: FittedInsertion) -> Iterator[Part]:
-    """Yield what each sensor along the needle adds to cost, gradient and precision."""
+def field_covariance(fitted: FittedInsertion) -> Floats:
+    """Return the covariance (r, r), mm², of the field's error in the mean readings of the tip, on an axis."""
+    position = fitted.readings[0]
+    path = np.cumsum(np.append(0.0, np.abs(fitted.rows[:, DB_X])))
+    place = position.between(path) / fitted.nominal.scenario.tracker.field_length_mm
+    since, sds = np.array(fitted.fields).T
+    begun = fitted.timeline.begun[position.index]
+    sd = sds[np.clip(np.searchsorted(since, begun, side="right") - 1, 0, None)]
+    covariance: Floats = np.multiply.outer(sd, sd) * np.exp(-np.abs(place[:, None] - place))
+    return covariance
+
+
+def inform_along(fitted: FittedInsertion, gradient: Floats, precision: Floats) -> tuple[Floats, Floats]:
+    """Return the downhill gradient (K,) and the precision (K, K) with the readings of sensors along the needle."""
+    gradient, precision = gradient.copy(), precision.copy()
     for k, one in enumerate(fitted.along):
-        cost, gradient = 0.0, np.zeros(fitted.parameters.size)
-        precision = np.zeros((gradient.size, gradient.size))
         bins, ends = fitted.bins[k], fitted.quantities[k]
         depth = fitted.depths(bins)
         slopes = fitted.along_slopes(depth, k)
         jacobian = one.jacobian(bins, ends, depth, slopes, fitted.parameters, fitted.timeline)
         for left, rows in _whitened(one, bins, fitted.along_residuals[k], jacobian):
-            cost += 0.5 * float(left @ left)
             gradient += rows.T @ left
             precision += rows.T @ rows
-        seen = bins.count > 0.0
-        model = one.sensor.model_error(bins.value)[seen] ** 2
-        noise = one.sensor.noise**2 / bins.count[seen]
-        yield Part(one.name, cost, int(seen.sum()), gradient, precision, kept_share(noise, model))
+    return gradient, precision
 
 
 def cost_along(fitted: FittedInsertion) -> float:

@@ -35,34 +35,8 @@ class Perturbed:
     state: State
 
 
-LASTING = 10.0
-"""Moves over which the model's error lasts."""
 TRACKER = "tracker"
 """Name of the tracker among the sensors."""
-
-
-class Part(NamedTuple):
-    """Share of a sensor in the cost of the fit, its downhill gradient (K,), and its second derivative (K, K)."""
-
-    name: str
-    cost: float
-    values: int  # number of its values
-    gradient: Floats
-    precision: Floats
-    share: float  # of its weight that it keeps where the model's error lasts from move to move
-
-    def temper(self) -> "Part":
-        """Return the part with the weight that it has with a lasting error of the model."""
-        share = self.share
-        return self._replace(
-            cost=share * self.cost, gradient=share * self.gradient, precision=share * self.precision
-        )
-
-
-def kept_share(noise: Floats, model: Floats) -> float:
-    """Return the mean share of their weight that means keep where the model's error lasts; of two variances (r,)."""
-    shares = (noise + model) / (noise + LASTING * model)
-    return float(shares.mean()) if shares.size else 1.0
 
 
 class Simulated(NamedTuple):
@@ -100,7 +74,6 @@ class FittedInsertion:
     along: tuple[SensorFit, ...] = ()  # sensors along the needle
     quantities: tuple[Floats, ...] = ()  # their values (m + 1, d, 1 + p) at the ends of the moves
     along_curves: tuple[Floats, ...] = ()  # derivatives (K, g, d) of their values over the depths
-    parts: tuple[Part, ...] = ()  # of the last step of the fit, before it
     # standard deviations (mm) of the tracker's error that is correlated along the path, each from a time (s) on
     fields: tuple[tuple[float, float], ...] = ()
 

@@ -34,6 +34,7 @@ from flexneedle.estimation.axial import (
     rest_variance,
 )
 from flexneedle.estimation.estimate import NONE, describe_estimate
+from flexneedle.estimation.faults import Fault, find_faults
 from flexneedle.estimation.fit import (
     ROUND,
     Whitening,
@@ -43,7 +44,7 @@ from flexneedle.estimation.fit import (
     simulate_due,
     variance_of_rows,
 )
-from flexneedle.estimation.fitted import TRACKER, FittedInsertion, Part
+from flexneedle.estimation.fitted import TRACKER, FittedInsertion
 from flexneedle.estimation.lateral import components, directions, from_components, variance_of
 from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
@@ -323,29 +324,9 @@ class Identified(FittedInsertion):
         inside = fitted.tips[-1, X] > 0.0
         return fitted.change(residual=low_pass(self.settings, fitted.without_field(left)) if inside else 0.0)
 
-    def conflict(self, name: str) -> float:
-        """Return the cost of a fit to all less the costs of fits to a sensor and to the others, to second order.
-
-        About 0 or below for sensors that agree.
-        """
-        parts = [one.temper() for one in self.parts]
-        others = [one for one in parts if one.name != name]
-        alone = [one for one in parts if one.name == name]
-        return self._least_cost(parts) - self._least_cost(others) - self._least_cost(alone)
-
-    def misfit(self, name: str) -> float:
-        """Return the cost per value of a fit without a sensor, to second order; 0 if no other has values."""
-        others = [one for one in self.parts if one.name != name]
-        values = sum(one.values for one in others)
-        return self._least_cost(others) / values if values else 0.0
-
-    def _least_cost(self, parts: Sequence[Part]) -> float:
-        """Return the least cost of a fit to some sensors, to second order about the last step of the fit."""
-        off = self.parameters - self.prior.mean
-        gradient = sum((one.gradient for one in parts), -self.prior.precision @ off)
-        precision = sum((one.precision for one in parts), self.prior.precision)
-        fall = 0.5 * gradient @ np.linalg.solve(precision, gradient)
-        return sum(one.cost for one in parts) + self.prior.cost(self.parameters) - float(fall)
+    def faults(self) -> dict[str, Fault]:
+        """Return the likeliest fault of each sensor by name, see `flexneedle.estimation.faults`."""
+        return find_faults(self)
 
     @property
     def cost(self) -> float:

@@ -13,20 +13,18 @@ import numpy as np
 
 from flexneedle.estimation.along import without_prediction
 from flexneedle.estimation.estimate import Estimate, can_fuse
+from flexneedle.estimation.faults import Fault
 from flexneedle.estimation.fitted import TRACKER
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.ports import NeedleSensor
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
-from flexneedle.types import OK, SensorState, Verdict, VerdictKind, X
+from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_STEPS = 12  # of the largest advance: readings of which are left out
-_CONFLICT = 6.0  # cost by which sensors contradict each other; healthy ones reach 5 in training worlds
-_SURE = 2.0  # times that cost: one of them is wrong
-_CLEAR, _CLEARER = 2.5, 1.6  # ratios of the misfits without another sensor and without the faulty one
-_LEAST_MISFIT = 0.05  # cost per value of a fit that is good in any case
-_OUTLYING = 0.5  # share of outliers in a period, which are no chance
+_FAULTY = 7.0  # ln of the Bayes factor, from which a sensor is faulty
+_IN_DOUBT = 3.0  # from which the tracker may be: then the needle is held
+_CLEAR = 3.0  # by which a fault must be likelier than another
 
 
 @dataclass(frozen=True)
@@ -84,79 +82,78 @@ def _read_sensor(
         predicted.compare(sensor.title, readings) if can_fuse(predicted) else without_prediction(readings)
     )
     max_age = scenario.control.stale_after_s + now - begun + sensor.delay_s + 3.0 * sensor.delay_sd_s
-    checked = check_readings(readings, compared, now, max_age)
+    monitor, checked = check_readings(monitor, readings, compared, now, max_age)
     good = np.array([one.verdict.ok for one in checked])
-    outlying = np.array([one.verdict.kind is VerdictKind.OUTLIER for one in checked])
-    # Where most are outliers, they are no chance: the sensor is faulty, or the prediction is wrong.
-    judged = good | outlying if outlying.sum() > _OUTLYING * (good | outlying).sum() else good
-    nis = compared.nis(judged) if judged.any() else math.nan
-    monitor = monitor.innovate(nis).hear(one.reading.time for one in checked if one.verdict.ok)
+    nis = compared.nis(good) if good.any() else math.nan
+    monitor = monitor.hear(one.reading.time for one in checked if one.verdict.ok)
+    if not _is_seen(
+        sensor, scenario, predicted
+    ):  # an image without the needle is no loss before it comes there
+        monitor = monitor.hear(
+            one.reading.time
+            for one in checked
+            if one.verdict.kind is VerdictKind.MISSING and one.reading.status == VISIBLE
+        )
     if monitor.excluded.ok:
         frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
         monitor = replace(monitor, excluded=frozen)
     return monitor, SensorState(sensor.title, checked, monitor.excluded, nis)
 
 
+def _is_seen(sensor: Sensor, scenario: Scenario, predicted: Any) -> bool:
+    """Return if the sensor should measure the predicted needle."""
+    nodes = predicted.state.nodes
+    needle = Needles(nodes[None], scenario.needle.length_mm / (len(nodes) - 1))
+    return bool(sensor.sees(needle, scenario.setup.axes).any())
+
+
 def exclude_faulty(
-    scenario: Scenario, estimate: Any, watch: Watch, states: Sequence[SensorState], before: Watch
+    estimate: Any, watch: Watch, states: Sequence[SensorState], before: Watch
 ) -> tuple[Any, Watch, tuple[SensorState, ...], Verdict]:
     """Return estimate, watch and states after an exclusion, and a verdict: not OK if the needle must be held.
 
     before: the watch of the period before, to see which sensors have been found frozen since.
     """
-    since = _time_of_depth(estimate, scenario)
+    depth = float(estimate.tips[-1, X])
     for one in states:
         if not one.verdict.ok and before.of(one.name).excluded.ok:  # frozen
+            since = _time_of_depth(estimate, min(depth, watch.of(one.name).since))
             return estimate.without(one.name, since), watch, tuple(states), OK
-    active = [name for name in (TRACKER, *(one.name for one in states)) if watch.of(name).excluded.ok]
-    conflicts = {name: estimate.conflict(name) for name in active}
-    surprised = any(watch.of(name).surprised for name in active)
-    faulty, verdict = judge_conflict(
-        conflicts, {name: estimate.misfit(name) for name in active}, surprised=surprised
-    )
+    faults = {name: one for name, one in estimate.faults().items() if watch.of(name).excluded.ok}
+    faulty, verdict = judge_faults(faults)
     if not faulty:
         return estimate, watch, tuple(states), verdict
     watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
     if faulty == TRACKER:
         return estimate, watch, tuple(states), verdict
     after = tuple(replace(one, verdict=verdict) if one.name == faulty else one for one in states)
-    return estimate.without(faulty, since), watch, after, OK
+    return estimate.without(faulty, _time_of_depth(estimate, faults[faulty].since)), watch, after, OK
 
 
-def judge_conflict(
-    conflicts: Mapping[str, float], misfits: Mapping[str, float], *, surprised: bool = False
-) -> tuple[str, Verdict]:
+def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
     """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
-    Sensors that contradict each other cost the fit to all more than fits to each alone. What is left without the faulty
-    one agrees with the model, and what is left without another does not. While this is not clear the insertion
-    continues, but not up to twice the limit of the cost.
+    A wrong exclusion leaves the tracker alone, and a hold harms nobody: so a fault of the tracker needs less.
 
-    conflicts, misfits: of the sensors by name, as of an `Identified`; surprised: True if readings are far from their
-    predictions, since a sensor may contradict itself, too.
+    faults: the likeliest of each sensor by name.
     """
-    most = max(conflicts.values(), default=0.0)
-    if most <= _CONFLICT and not surprised:
-        return "", OK
-    first, *others = sorted(misfits, key=lambda name: misfits[name])
-    ratio = min((misfits[name] for name in others), default=math.inf) / max(misfits[first], _LEAST_MISFIT)
-    sure = most > _SURE * _CONFLICT
-    if ratio > (_CLEARER if sure else _CLEAR) or (first == TRACKER and most > _CONFLICT):
-        reason = f"the fit to all costs {most:.0f} more than to each alone, limit {_CONFLICT:.0f}"
-        if most <= _CONFLICT:
-            reason = f"without it the fit is {ratio:.1f} times better than without another"
-        return first, Verdict(
-            VerdictKind.CONTRADICTED, f"{TRACKER}: {reason}" if first == TRACKER else reason
+    odds = {name: one.log_odds for name, one in faults.items()}
+    tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
+    name = max(odds, key=lambda name: odds[name], default="")
+    if most > _FAULTY and most - tip > _CLEAR:
+        return name, Verdict(
+            VerdictKind.CONTRADICTED, f"ln of the odds of a fault is {most:.1f}, limit {_FAULTY:g}"
         )
-    if not sure:
-        return "", OK
-    reason = f"{', '.join(misfits)} contradict each other, and it is not clear which is wrong"
-    return "", Verdict(VerdictKind.CONTRADICTED, reason)
+    if tip > _IN_DOUBT and most - tip < _CLEAR:
+        reason = f"{TRACKER}: ln of the odds of a fault is {tip:.1f}, limit {_IN_DOUBT:g}"
+        if tip - most > _CLEAR:
+            return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
+        return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
+    return "", OK
 
 
-def _time_of_depth(estimate: Any, scenario: Scenario) -> float:
-    """Return the time (s) at which the tip was some steps less deep than now."""
-    depth = float(estimate.tips[-1, X]) - _STEPS * scenario.setup.max_advance_mm
+def _time_of_depth(estimate: Any, depth: float) -> float:
+    """Return the time (s) at which the tip came to a depth (mm)."""
     k = int(np.searchsorted(np.maximum.accumulate(estimate.tips[1:, X]), depth))
     return float(estimate.moves[min(k, len(estimate.moves) - 1)].motion.begun)
 

@@ -113,7 +113,7 @@ def observe_all(
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
     heard = (one.measurement.time for one in found.readings if one.verdict.ok)
     watch = watch.change(TRACKER, watch.of(TRACKER).hear(heard))
-    estimate, watch, sensors, verdict = exclude_faulty(scenario, found.estimate, watch, sensors, before.watch)
+    estimate, watch, sensors, verdict = exclude_faulty(found.estimate, watch, sensors, before.watch)
     if not trusted:
         verdict = watch.of(TRACKER).excluded
     if verdict.ok:

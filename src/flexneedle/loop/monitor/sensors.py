@@ -1,13 +1,13 @@
 """The monitor of the sensors along the needle: verdicts on readings, and on each sensor.
 
-A reading far from its prediction is an outlier, and readings that repeat while the needle moves are frozen. A sensor
-that contradicts the others is found by the fit (`flexneedle.loop.fusing`).
+A reading far from its prediction is an outlier, and readings that repeat while the needle moves are frozen. Outliers
+one after another are no chance, and are used: a sensor that contradicts the others is found by the fit
+(`flexneedle.loop.fusing`).
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 
 import numpy as np
 
@@ -15,9 +15,8 @@ from flexneedle.estimation.along import Comparison
 from flexneedle.types import OK, VISIBLE, CheckedReading, Floats, Reading, Verdict, VerdictKind
 
 _OUTLIER_SDS = 6.0
+_MOST_OUTLIERS = 6  # one after another; later ones are no chance
 _REPEATS = 10
-_WINDOW = 8  # periods
-_SURPRISE = 2.0  # normalised square of the innovation
 
 
 @dataclass(frozen=True)
@@ -25,29 +24,20 @@ class SensorMonitor:
     """State of the monitor of one sensor. Frozen: each method returns the next state.
 
     newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them;
-    nis: normalised squares of the innovations of the last periods; excluded: why the sensor does not count any more;
-    heard: time (s) of the last good reading, 0 before the first.
+    outliers: number of the last readings, one after another, far from their predictions; excluded: why the sensor does
+    not count any more; heard: time (s) of the last reading that is good, or that rightly sees no needle, 0 before.
     """
 
     newest: Reading | None = None
     repeats: int = 1
     since: float = 0.0
-    nis: tuple[float, ...] = ()
+    outliers: int = 0
     excluded: Verdict = OK
     heard: float = 0.0
 
     def hear(self, times: Iterable[float]) -> "SensorMonitor":
-        """Return the state with the times (s) of good readings."""
+        """Return the state with the times (s) of readings."""
         return replace(self, heard=max([self.heard, *times]))
-
-    def innovate(self, nis: float) -> "SensorMonitor":
-        """Return the state with the innovation of a period; NaN is none."""
-        return self if math.isnan(nis) else replace(self, nis=(*self.nis, nis)[-_WINDOW:])
-
-    @property
-    def surprised(self) -> bool:
-        """True if the last innovations are improbably large: their median, since the needle itself may leap."""
-        return len(self.nis) == _WINDOW and median(self.nis) > _SURPRISE
 
     def add(self, readings: Sequence[Reading], depth: float) -> "SensorMonitor":
         """Return the state with readings, with the tip at a depth (mm)."""
@@ -69,13 +59,19 @@ class SensorMonitor:
 
 
 def check_readings(
-    readings: Sequence[Reading], compared: Comparison, now: float, max_age: float
-) -> tuple[CheckedReading, ...]:
+    monitor: SensorMonitor, readings: Sequence[Reading], compared: Comparison, now: float, max_age: float
+) -> tuple[SensorMonitor, tuple[CheckedReading, ...]]:
     """Check readings, each beside its prediction, at a time `now` (s); max_age (s)."""
-    return tuple(
-        CheckedReading(one, _check(one, sds[np.isfinite(values)], now, max_age))
-        for one, values, sds in zip(readings, compared.value, compared.sds, strict=True)
-    )
+    checked = []
+    for one, values, sds in zip(readings, compared.value, compared.sds, strict=True):
+        verdict = _check(one, sds[np.isfinite(values)], now, max_age)
+        if verdict.ok:
+            monitor = replace(monitor, outliers=0)
+        elif verdict.kind is VerdictKind.OUTLIER:
+            monitor = replace(monitor, outliers=monitor.outliers + 1)
+            verdict = OK if monitor.outliers > _MOST_OUTLIERS else verdict
+        checked.append(CheckedReading(one, verdict))
+    return monitor, tuple(checked)
 
 
 def _check(one: Reading, sds: Floats, now: float, max_age: float) -> Verdict:

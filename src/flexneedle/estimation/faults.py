@@ -1,0 +1,172 @@
+"""Faults of sensors: an error of one of them that grows from some depth on, which the fit does not know.
+
+A fault is a random walk, or a line, over the depth from its onset on, of each value of a sensor. The logarithm of its
+Bayes factor says how much likelier the readings are with it than without, by a linear model about the fit. It is the
+generalised likelihood ratio for a change of unknown time (Willsky and Jones, IEEE Trans. Autom. Control 21:108, 1976),
+with a prior on the size of the change.
+
+A fault of the tracker is what other sensors say against it: what it says alone against the model is subtracted, since
+the model is late after a leap of the needle, which the tracker sees first.
+
+The model's error lasts from move to move, so that the readings are averaged over some moves, whose means have its whole
+variance.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.estimation.fit import field_covariance, jacobian_of
+from flexneedle.estimation.fitted import TRACKER, FittedInsertion
+from flexneedle.types import Flags, Floats, X
+
+_MOVES = 10  # over which the model's error lasts
+_ONSETS_MM = (5.0, 10.0, 20.0, np.inf)  # above the tip
+_GROWTH_MM = 40.0  # depth over which a fault grows
+_SIZE = 1.5  # to this many standard deviations of a sensor's noise or offset
+
+
+class Fault(NamedTuple):
+    """What speaks for a fault: ln of the Bayes factor, and the depth (mm) of the tip at its onset."""
+
+    log_odds: float
+    since: float
+
+
+class _Rows(NamedTuple):
+    """Mean residuals of a sensor: n values."""
+
+    depth: Floats  # of the tip (n,), mm
+    left: Floats  # (n,)
+    jacobian: Floats  # (n, K)
+    variance: Floats  # of noise and model error (n,)
+    value: NDArray[np.intp]  # number (n,) of the value in a reading
+    shares: Floats  # weights (n, b) of the moves in the means
+
+
+def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
+    """Return for the `TRACKER` and each sensor along the needle, by name, the likeliest fault."""
+    rows = {name: one for name, one in _all_rows(fitted) if one.left.size}
+    if not rows:
+        return {}
+    left, jacobian, variance = (
+        np.concatenate([getattr(one, key) for one in rows.values()])
+        for key in ("left", "jacobian", "variance")
+    )
+    left = left + jacobian @ (fitted.parameters - fitted.prior.mean)
+    covariance = jacobian @ fitted.prior.covariance @ jacobian.T + np.diag(variance)
+    if fitted.has_field and TRACKER in rows:
+        tip = rows[TRACKER]
+        own = slice(tip.left.size)  # the first rows
+        covariance[own, own] += _is_same(tip.value) * (tip.shares @ field_covariance(fitted) @ tip.shares.T)
+    precision = np.linalg.inv(covariance)
+    weighted, begin, found = precision @ left, 0, {}
+    depth = float(fitted.tips[-1, X])
+    for name, one in rows.items():
+        own, size = slice(begin, begin + one.left.size), _size(fitted, name)
+        found[name] = _find_fault(one, weighted[own], precision[own, own], size, depth)
+        if name == TRACKER:
+            alone = np.linalg.inv(covariance[own, own])
+            against_model = _find_fault(one, alone @ left[own], alone, size, depth).log_odds
+            found[name] = found[name]._replace(log_odds=found[name].log_odds - max(0.0, against_model))
+        begin = own.stop
+    return found
+
+
+def _find_fault(rows: _Rows, weighted: Floats, precision: Floats, size: float, depth: float) -> Fault:
+    """Return the likeliest fault of a sensor; size: to which it grows.
+
+    weighted, precision: the sensor's parts of C⁻¹ r (n,) and C⁻¹ (n, n), of all residuals r with the covariance C.
+    """
+    found = [Fault(-np.inf, depth)]
+    for back in _ONSETS_MM:
+        since = max(0.0, depth - back)
+        late = np.flatnonzero(rows.depth > since)
+        if late.size:
+            way = (rows.depth[late] - since) / _GROWTH_MM
+            same = size**2 * _is_same(rows.value[late])
+            for shape in (np.minimum(way[:, None], way), np.multiply.outer(way, way)):
+                error = same * shape
+                system = np.eye(late.size) + error @ precision[np.ix_(late, late)]
+                gain = 0.5 * weighted[late] @ np.linalg.solve(system, error @ weighted[late])
+                found.append(Fault(float(gain - 0.5 * np.linalg.slogdet(system)[1]), since))
+        if since == 0.0:
+            break
+    return max(found)
+
+
+def _size(fitted: FittedInsertion, name: str) -> float:
+    """Return the standard deviation to which the error of a faulty sensor grows."""
+    if name == TRACKER:
+        return fitted.nominal.scenario.control.miss_limit_mm
+    sensor = next(one.sensor for one in fitted.along if one.name == name)
+    return _SIZE * max(sensor.noise, sensor.offset_sd)
+
+
+def _is_same(value: NDArray[np.intp]) -> Flags:
+    same: Flags = value[:, None] == value
+    return same
+
+
+def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
+    """Yield the rows of each sensor by name, the tracker first."""
+    position, left = fitted.readings[0], fitted.residuals[0]
+    jacobian = jacobian_of(fitted)[: len(left)]
+    across = [np.real, np.imag][: fitted.axes]
+    model = fitted.sensors[0].unexplained(fitted.nominal.scenario, fitted.settings) ** 2
+    noise = fitted.variances()[0] + position.estimate_sag(fitted.laterals[0]) ** 2 - model
+    shape = (len(left), fitted.axes)
+    yield (
+        TRACKER,
+        _average(
+            position.index,
+            position.between(fitted.tips[:, X]),
+            np.stack([part(left) for part in across], axis=1),
+            np.stack([part(jacobian) for part in across], axis=1),
+            np.broadcast_to(noise[:, None], shape),
+            np.full(shape, model),
+        ),
+    )
+    for k, one in enumerate(fitted.along):
+        bins = fitted.bins[k]
+        depth = fitted.depths(bins)
+        slopes = fitted.along_slopes(depth, k)
+        ends, line = fitted.quantities[k], fitted.timeline
+        noise = one.sensor.noise**2 / np.where(bins.count > 0.0, bins.count, np.nan)
+        yield (
+            one.name,
+            _average(
+                bins.index,
+                depth,
+                fitted.along_residuals[k],
+                one.jacobian(bins, ends, depth, slopes, fitted.parameters, line),
+                noise,
+                one.sensor.model_error(bins.value) ** 2 + one.sensor.wander_sd**2,
+            ),
+        )
+
+
+def _average(
+    index: NDArray[np.intp], depth: Floats, left: Floats, jacobian: Floats, noise: Floats, model: Floats
+) -> _Rows:
+    """Return the means over some moves each of residuals (b, d) in moves (b,).
+
+    depth: (b,), mm; jacobian: (b, d, K); noise, model: variances (b, d) of the residuals and of the model's error, NaN
+    where nothing was measured.
+    """
+    groups = index // _MOVES
+    shares = (groups == np.unique(groups)[:, None])[:, None, :] & np.isfinite(noise).T  # (g, d, b)
+    counts = shares.sum(axis=2)
+    seen = counts > 0
+    weights = shares / np.maximum(counts, 1)[:, :, None]
+    level = np.nan_to_num(noise)
+    return _Rows(
+        np.broadcast_to((weights @ depth), counts.shape)[seen],
+        np.einsum("gdb,bd->gd", weights, left)[seen],
+        np.einsum("gdb,bdk->gdk", weights, jacobian)[seen],
+        (np.einsum("gdb,bd->gd", weights**2, level) + np.einsum("gdb,bd->gd", weights, model))[seen],
+        np.broadcast_to(np.arange(counts.shape[1]), counts.shape)[seen],
+        weights[seen],
+    )
