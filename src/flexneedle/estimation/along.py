@@ -253,6 +253,12 @@ class SensorFit:
         """Return values (r, d) of a sensor that rolls in the stage's axes, others as they are."""
         return turn(value, facing, self.axes) if self.sensor.rolls else value
 
+    def in_its_axes(self, rows: Floats, bins: Bins) -> Floats:
+        """Return rows (…, b, d) in the sensor's own axes."""
+        flat = rows.reshape(-1, self.size)
+        facing = np.tile(bins.facing.conj(), len(flat) // max(1, len(bins.facing)))
+        return self._turned(flat, facing).reshape(rows.shape)
+
     def _gains(self, parameters: Floats) -> Floats:
         """Return the gains (d,), or (1,) where their error is not estimated."""
         errors = parameters[self.slots.gain]

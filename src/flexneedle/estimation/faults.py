@@ -1,17 +1,18 @@
 """Faults of sensors: an error of one of them that grows from some depth on, which the fit does not know.
 
-A fault is a random walk, or a line, over the depth from its onset on, of each value of a sensor. The logarithm of its
-Bayes factor says how much likelier the readings are with it than without, by a linear model about the fit. It is the
-generalised likelihood ratio for a change of unknown time (Willsky and Jones, IEEE Trans. Autom. Control 21:108, 1976),
-with a prior on the size of the change.
+A fault is a random walk, or a line, over the depth from its onset on, of each value of a sensor or of all together. Its
+odds are the logarithm of its Bayes factor, of readings with and without it, by a linear model about the fit. This is
+the generalised likelihood ratio for a change of unknown time (Willsky and Jones, IEEE Trans. Autom. Control 21:108,
+1976), with a prior on the size of the change.
 
-A fault of the tracker is what other sensors say against it: what it says alone against the model is subtracted, since
-the model is late after a leap of the needle, which the tracker sees first.
+After a leap of the needle the model is late. So the tracker's own evidence against the model is no evidence of its
+fault and is subtracted, as is the evidence of a sensor beside which no other measures.
 
 The model's error lasts from move to move, so that the readings are averaged over some moves, whose means have its whole
 variance.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -19,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.estimation.fit import field_covariance, jacobian_of
-from flexneedle.estimation.fitted import TRACKER, FittedInsertion
+from flexneedle.estimation.fitted import LASTING, TRACKER, FittedInsertion
 from flexneedle.types import Flags, Floats, X
 
-_MOVES = 10  # over which the model's error lasts
 _ONSETS_MM = (5.0, 10.0, 20.0, np.inf)  # above the tip
+_BESIDE_MM = 10.0  # above the tip, where another sensor measured
 _GROWTH_MM = 40.0  # depth over which a fault grows
 _SIZE = 1.5  # to this many standard deviations of a sensor's noise or offset
 
 
 class Fault(NamedTuple):
-    """What speaks for a fault: ln of the Bayes factor, and the depth (mm) of the tip at its onset."""
+    """A fault: ln of its Bayes factor, and the depth (mm) of the tip at its onset."""
 
     log_odds: float
     since: float
@@ -43,6 +44,7 @@ class _Rows(NamedTuple):
     jacobian: Floats  # (n, K)
     variance: Floats  # of noise and model error (n,)
     value: NDArray[np.intp]  # number (n,) of the value in a reading
+    across: int  # number of values of a lateral pair or of a single value
     shares: Floats  # weights (n, b) of the moves in the means
 
 
@@ -67,7 +69,8 @@ def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
     for name, one in rows.items():
         own, size = slice(begin, begin + one.left.size), _size(fitted, name)
         found[name] = _find_fault(one, weighted[own], precision[own, own], size, depth)
-        if name == TRACKER:
+        others = [other.depth.max() for key, other in rows.items() if key != name]
+        if name == TRACKER or max(others, default=-np.inf) < depth - _BESIDE_MM:
             alone = np.linalg.inv(covariance[own, own])
             against_model = _find_fault(one, alone @ left[own], alone, size, depth).log_odds
             found[name] = found[name]._replace(log_odds=found[name].log_odds - max(0.0, against_model))
@@ -80,15 +83,15 @@ def _find_fault(rows: _Rows, weighted: Floats, precision: Floats, size: float, d
 
     weighted, precision: the sensor's parts of C⁻¹ r (n,) and C⁻¹ (n, n), of all residuals r with the covariance C.
     """
-    found = [Fault(-np.inf, depth)]
+    found, common = [Fault(-np.inf, depth)], rows.value % rows.across
     for back in _ONSETS_MM:
         since = max(0.0, depth - back)
         late = np.flatnonzero(rows.depth > since)
         if late.size:
             way = (rows.depth[late] - since) / _GROWTH_MM
-            same = size**2 * _is_same(rows.value[late])
-            for shape in (np.minimum(way[:, None], way), np.multiply.outer(way, way)):
-                error = same * shape
+            walk, line = np.minimum(way[:, None], way), np.multiply.outer(way, way)
+            for shape, values in itertools.product((walk, line), (rows.value, common)):
+                error = size**2 * shape * _is_same(values[late])
                 system = np.eye(late.size) + error @ precision[np.ix_(late, late)]
                 gain = 0.5 * weighted[late] @ np.linalg.solve(system, error @ weighted[late])
                 found.append(Fault(float(gain - 0.5 * np.linalg.slogdet(system)[1]), since))
@@ -127,6 +130,7 @@ def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
             np.stack([part(jacobian) for part in across], axis=1),
             np.broadcast_to(noise[:, None], shape),
             np.full(shape, model),
+            fitted.axes,
         ),
     )
     for k, one in enumerate(fitted.along):
@@ -134,29 +138,37 @@ def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
         depth = fitted.depths(bins)
         slopes = fitted.along_slopes(depth, k)
         ends, line = fitted.quantities[k], fitted.timeline
+        jacobian = one.jacobian(bins, ends, depth, slopes, fitted.parameters, line)
         noise = one.sensor.noise**2 / np.where(bins.count > 0.0, bins.count, np.nan)
         yield (
             one.name,
             _average(
                 bins.index,
                 depth,
-                fitted.along_residuals[k],
-                one.jacobian(bins, ends, depth, slopes, fitted.parameters, line),
+                one.in_its_axes(fitted.along_residuals[k], bins),
+                one.in_its_axes(jacobian.transpose(2, 0, 1), bins).transpose(1, 2, 0),
                 noise,
                 one.sensor.model_error(bins.value) ** 2 + one.sensor.wander_sd**2,
+                fitted.axes if one.sensor.paired else 1,
             ),
         )
 
 
 def _average(
-    index: NDArray[np.intp], depth: Floats, left: Floats, jacobian: Floats, noise: Floats, model: Floats
+    index: NDArray[np.intp],
+    depth: Floats,
+    left: Floats,
+    jacobian: Floats,
+    noise: Floats,
+    model: Floats,
+    across: int,
 ) -> _Rows:
     """Return the means over some moves each of residuals (b, d) in moves (b,).
 
     depth: (b,), mm; jacobian: (b, d, K); noise, model: variances (b, d) of the residuals and of the model's error, NaN
     where nothing was measured.
     """
-    groups = index // _MOVES
+    groups = index // LASTING
     shares = (groups == np.unique(groups)[:, None])[:, None, :] & np.isfinite(noise).T  # (g, d, b)
     counts = shares.sum(axis=2)
     seen = counts > 0
@@ -168,5 +180,6 @@ def _average(
         np.einsum("gdb,bdk->gdk", weights, jacobian)[seen],
         (np.einsum("gdb,bd->gd", weights**2, level) + np.einsum("gdb,bd->gd", weights, model))[seen],
         np.broadcast_to(np.arange(counts.shape[1]), counts.shape)[seen],
+        across,
         weights[seen],
     )

@@ -35,6 +35,8 @@ class Perturbed:
     state: State
 
 
+LASTING = 10
+"""Moves over which the model's error lasts."""
 TRACKER = "tracker"
 """Name of the tracker among the sensors."""
 

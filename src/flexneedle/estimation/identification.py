@@ -44,7 +44,7 @@ from flexneedle.estimation.fit import (
     simulate_due,
     variance_of_rows,
 )
-from flexneedle.estimation.fitted import TRACKER, FittedInsertion
+from flexneedle.estimation.fitted import LASTING, TRACKER, FittedInsertion
 from flexneedle.estimation.lateral import components, directions, from_components, variance_of
 from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
@@ -271,8 +271,16 @@ class Identified(FittedInsertion):
         covariance = np.zeros((3, 3))
         covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
         model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
-        covariance[1:, 1:] = parts @ self.covariance @ parts.T + model**2 * np.diag([1.0, self.axes - 1.0])
+        left = model**2 * (1.0 - math.exp(-2.0 * self._age_of_residual / LASTING))
+        covariance[1:, 1:] = parts @ self.covariance @ parts.T + left * np.diag([1.0, self.axes - 1.0])
         return covariance
+
+    @property
+    def _age_of_residual(self) -> float:
+        """Moves to which the low-passed residual refers, back from now: the rest of the model's error is unknown."""
+        read = [k for k, done in enumerate(self.moves) if done.measurements]
+        lag = 1.0 / max(self.settings.residual_gain, LEAST_SD)
+        return len(self.moves) - 1 - read[-1] + lag if read else math.inf
 
     @property
     def bias(self) -> Point:

@@ -22,7 +22,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_FAULTY = 7.0  # ln of the Bayes factor, from which a sensor is faulty
+_FAULTY = 6.0  # ln of the Bayes factor, from which a sensor is faulty
 _IN_DOUBT = 3.0  # from which the tracker may be: then the needle is held
 _CLEAR = 3.0  # by which a fault must be likelier than another
 
