@@ -89,15 +89,29 @@ def _find_fault(rows: _Rows, weighted: Floats, precision: Floats, size: float, d
         late = np.flatnonzero(rows.depth > since)
         if late.size:
             way = (rows.depth[late] - since) / _GROWTH_MM
-            walk, line = np.minimum(way[:, None], way), np.multiply.outer(way, way)
-            for shape, values in itertools.product((walk, line), (rows.value, common)):
-                error = size**2 * shape * _is_same(values[late])
-                system = np.eye(late.size) + error @ precision[np.ix_(late, late)]
-                gain = 0.5 * weighted[late] @ np.linalg.solve(system, error @ weighted[late])
-                found.append(Fault(float(gain - 0.5 * np.linalg.slogdet(system)[1]), since))
+            inner = precision[np.ix_(late, late)]
+            steps = np.unique(way)
+            walk = np.sqrt(np.diff(steps, prepend=0.0)) * (way[:, None] >= steps)
+            for growth, values in itertools.product((walk, way[:, None]), (rows.value, common)):
+                odds = _compute_log_odds(size * _spread(growth, values[late]), weighted[late], inner)
+                found.append(Fault(odds, since))
         if since == 0.0:
             break
     return max(found)
+
+
+def _spread(growth: Floats, values: NDArray[np.intp]) -> Floats:
+    """Return the square root (n, g · v) of the covariance of errors, from that of one value (n, g); values: (n,)."""
+    own = values[:, None] == np.unique(values)
+    spread: Floats = (growth[:, :, None] * own[:, None]).reshape(len(growth), -1)
+    return spread
+
+
+def _compute_log_odds(root: Floats, weighted: Floats, precision: Floats) -> float:
+    """Return ln of the ratio of the densities of residuals with an error of covariance root rootᵀ, and without."""
+    lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ precision @ root)
+    known = np.linalg.solve(lower, root.T @ weighted)
+    return float(0.5 * known @ known - np.log(np.diag(lower)).sum())
 
 
 def _size(fitted: FittedInsertion, name: str) -> float:
