@@ -66,6 +66,13 @@ def test_with_a_fibre_a_lost_tracker_does_not_end_the_insertion(inserted):
     assert "holding" not in {one["state"] for one in done.ticks["states"]}
 
 
+def test_with_a_fibre_a_distorted_field_does_not_end_the_insertion(inserted):
+    done, tip = inserted("aurora:indicator=0.2")
+    assert done.outcome == "done"
+    assert math.dist(tip, done.target) < 0.6
+    assert "holding" not in {one["state"] for one in done.ticks["states"]}
+
+
 def test_without_readings_of_any_sensor_the_needle_is_held(inserted):
     done, tip = inserted("aurora:unplug", "fbgs:silence")
     assert (done.outcome, "no good reading of any sensor" in done.reason) == ("held", True), done.reason
