@@ -33,6 +33,7 @@ _DRIVERS = {
 """Axes of the guide and rolls of the needle in space, by name of a world's rig."""
 _TURNS_DEG = 1080.0  # the range of the rotation in the shipped rig file
 _STEERED = 0.2  # of a world's offset along z, where only the bevel steers: within reach of most bevels
+_SITES = (0.1, 0.25, 0.45, 0.7)  # from the tip, of the needle's length
 _PLANNER = {"plan.samples": 64, "plan.iterations": 10, "plan.max_iterations": 20}
 """A search that is shorter than the default: the plan is only where the insertion begins."""
 
@@ -49,6 +50,12 @@ class Case:
     def seed(self) -> int:
         """Seed of phantom, tracker and controller."""
         return FIRST_SEED + self.number
+
+    @property
+    def with_fibre(self) -> Scenario:
+        """The scenario with a fibre in the needle."""
+        sites = [round(share * self.scenario.needle.length_mm, 1) for share in _SITES]
+        return self.scenario.with_values({"sensor": [{"kind": "fbg", "sites_mm": sites}]})
 
     @property
     def path_mm(self) -> float:

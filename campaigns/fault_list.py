@@ -44,9 +44,9 @@ class Fault:
 
     because: pattern in the reason, with {axis} for the faulty axis; axis: its name, outside of rolls; rolls: whether
     the fault occurs in a roll in no case, in some ("some") or in all ("all"); decision_s: duration of a decision, if
-    that is the fault; timed: the time that counts, by its key in a row: from the fault to its detection; from the
-    motion in which the fault shows to the detection, if the motion begins after the fault; or from the fault until all
-    axes rest.
+    that is the fault; fibre: whether the needle has one; timed: the time that counts, by its key in a row: from the
+    fault to its detection; from the motion in which the fault shows to the detection, if the motion begins after the
+    fault; or from the fault until all axes rest.
     """
 
     group: str
@@ -58,6 +58,7 @@ class Fault:
     rolls: str = ""
     axis: str = "insertion"
     decision_s: float = field(default=0.0, kw_only=True)
+    fibre: bool = field(default=False, kw_only=True)
     timed: str = field(default="detection_s", kw_only=True)
 
     def falls_in_roll(self, rolls: bool) -> bool:
@@ -66,6 +67,7 @@ class Fault:
 
 
 _tracker = partial(Fault, "tracker")
+_sensors = partial(Fault, "sensors", fibre=True)
 _motors = partial(Fault, "motors")
 _computer = partial(Fault, "computer")
 _SOME = "some"
@@ -108,6 +110,8 @@ FAULTS: Sequence[Fault] = (
     _tracker("unplugged", Device("aurora:unplug"), HELD, 0.45, _NO_READING),
     _tracker("indicator high", Device("aurora:indicator=0.2"), HELD, 0.9, "^field distorted:"),
     _tracker("0.5 s late", Device("aurora:delay=0.5"), HELD, 0.6, _NO_READING),
+    _sensors("fibre unplugged", Device("fbgs:unplug"), CONTINUED),
+    _sensors("tracker unplugged, with a fibre", Device("aurora:unplug"), CONTINUED),
     # A motor that stalls at rest, or has next to nothing left, shows it only in its next step.
     _motors("stall", Device("galil:stall={channel}"), FAULT, 0.4, "{axis}", timed="from_motion_s"),
     _motors("roll stalls", Device("galil:stall={channel}"), FAULT, 0.4, "{axis}", "all"),

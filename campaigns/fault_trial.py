@@ -120,7 +120,9 @@ def _attempt(trial: Trial, rng: np.random.Generator, keep: Path | None) -> dict[
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="faults-")))
         setting = fault.injection.prepare(folder, stack)
-        (folder / "scenario.toml").write_text(dump_scenario(case.scenario))
+        (folder / "scenario.toml").write_text(
+            dump_scenario(case.with_fibre if fault.fibre else case.scenario)
+        )
         roll = case.roll(rng) if trial.rolls else 0.0
         options = _controller(trial, roll, folder, rng)
         scenario = str(folder / "scenario.toml")

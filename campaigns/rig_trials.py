@@ -118,15 +118,14 @@ def emulated_rig(folder: Path, scenario: str, seed: int, *, text: str | None = N
     text = shipped_rig() if text is None else text
     for before, after in {"/tmp/aurora": str(folder / "aurora"), "127.0.0.1:2323": "127.0.0.1:0"}.items():
         text = text.replace(before, after)
-    rig, truth = folder / "rig.toml", folder / "truth.csv"
-    rig.write_text(text)
-    command = [sys.executable, "-m", "flexneedle", "emulate", "rig", rig, scenario]
-    options = ["--seed", str(seed), "--truth", truth]
+    given, rig, truth = folder / "given.toml", folder / "rig.toml", folder / "truth.csv"
+    given.write_text(text)
+    command = [sys.executable, "-m", "flexneedle", "emulate", "rig", given, scenario]
+    options = ["--seed", str(seed), "--truth", truth, "--save", rig]
     process = subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         lines = Lines(process)
-        address = lines.until("ready", START_S)["ready"]["galil"]
-        rig.write_text(text.replace("127.0.0.1:0", address))
+        lines.until("ready", START_S)
         yield EmulatedRig(process, lines, rig, truth)
     finally:
         process.terminate()

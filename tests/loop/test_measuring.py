@@ -6,9 +6,18 @@ from dataclasses import replace
 import pytest
 
 import flexneedle
-from flexneedle.loop.measuring import observe, observe_before_start
+from flexneedle.loop.measuring import Observation, observe, observe_before_start
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
+from flexneedle.types import (
+    VISIBLE,
+    CheckedReading,
+    Frame,
+    Measurement,
+    Reading,
+    SensorReading,
+    SensorState,
+    Verdict,
+)
 
 OK = "ok"
 
@@ -230,3 +239,16 @@ def test_the_limit_of_the_innovation_grows_with_the_uncertainty_of_the_predictio
             one = Measurement(1.0, TIP[0], TIP[1] + off)
             observation = observe(SCENARIO, estimate, Monitor(SCENARIO.monitor), 0.8, 1.0, Recorded(one))
             assert str(observation.readings[0].verdict).split(":")[0] == verdict
+
+
+class Fusing(AtRest):
+    """An estimate that sensors along the needle correct."""
+
+    def compare(self):
+        raise NotImplementedError
+
+
+def test_only_a_sensor_that_corrects_the_estimate_measures_the_needle():
+    sensors = (SensorState("fbg", (CheckedReading(Reading(1.0, ((1e-3,),)), Verdict()),)),)
+    for estimate, sensed in ((Fusing(), True), (AtRest(), False)):
+        assert Observation(estimate, Monitor(SCENARIO.monitor), sensors=sensors).sensed is sensed

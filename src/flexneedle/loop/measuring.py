@@ -49,8 +49,8 @@ class Observation:
 
     @property
     def sensed(self) -> bool:
-        """Whether a sensor along the needle, in use, has a good reading of this period."""
-        return any(state.good for state in self.sensors)
+        """Whether a sensor along the needle has a good reading of this period that corrects the estimate."""
+        return bool(self._sensor_times)
 
     @property
     def newest(self) -> float:

@@ -1,4 +1,4 @@
-"""Insertions on the emulated rig with a fibre, over the protocols of motors, tracker and fibre."""
+"""Insertions on the emulated rig with sensors along the needle, over the protocols of all devices."""
 
 import math
 
@@ -20,6 +20,9 @@ SCENARIO = flexneedle.load_scenario("phantom").with_values(
         "sensor": [{"kind": "fbg", "sites_mm": [11.0, 26.0, 70.0, 105.0]}],
     }
 )
+SLICES = SCENARIO.with_values(
+    {"sensor": [{"kind": "slice", "name": f"slice {x:g}", "plane_mm": x} for x in (3.0, 7.0)]}
+)
 HALF_MM = 8.0
 
 
@@ -27,7 +30,7 @@ HALF_MM = 8.0
 def inserted(tmp_path):
     """Return a function that inserts with faults from half depth on, and returns the insertion and the true tip."""
 
-    def insert(*faults):
+    def insert(*faults, given=SCENARIO):
         waiting = list(faults)
 
         def inject(event):
@@ -36,11 +39,11 @@ def inserted(tmp_path):
                     rig.order(f"fault {waiting.pop()}")
 
         scenario, saved, truth = tmp_path / "scenario.toml", tmp_path / "saved.toml", tmp_path / "truth.csv"
-        scenario.write_text(dump_scenario(SCENARIO))
+        scenario.write_text(dump_scenario(given))
         options = ("--seed", 3, "--truth", truth, "--save", saved)
         with emulated_rig(rig_file(tmp_path), scenario, *options) as rig:
-            plan = flexneedle.plan(SCENARIO, seed=0)
-            done = flexneedle.insert(SCENARIO, plan, 3, rig=SupervisedRig(saved), listeners=[inject])
+            plan = flexneedle.plan(given, seed=0)
+            done = flexneedle.insert(given, plan, 3, rig=SupervisedRig(saved), listeners=[inject])
         return done, read_truth(truth).tips[-1, :3]
 
     return insert
@@ -64,6 +67,24 @@ def test_with_a_fibre_a_lost_tracker_does_not_end_the_insertion(inserted):
     last = [reading for period in done.periods for reading in period.readings][-1]
     assert last.measurement.time < done.periods[-1].time - 1.0
     assert "holding" not in {one["state"] for one in done.ticks["states"]}
+
+
+def test_with_a_fibre_a_distorted_field_does_not_end_the_insertion(inserted):
+    done, tip = inserted("aurora:indicator=0.2")
+    assert done.outcome == "done"
+    assert math.dist(tip, done.target) < 0.6
+    assert "holding" not in {one["state"] for one in done.ticks["states"]}
+
+
+def test_with_two_slices_a_lost_tracker_does_not_end_the_insertion(inserted):
+    done, tip = inserted("aurora:unplug", given=SLICES)
+    assert done.outcome == "done"
+    assert math.dist(tip, done.target) < 0.8
+    for name in ("slice 3", "slice 7"):
+        states = [one for period in done.periods for one in period.sensors if one.name == name]
+        assert all(one.verdict.ok for one in states)
+        good = [reading.time for one in states for reading in one.good]
+        assert 9.0 < (len(good) - 1) / (good[-1] - good[0]) < 11.0
 
 
 def test_without_readings_of_any_sensor_the_needle_is_held(inserted):

@@ -109,13 +109,13 @@ def _add_rig(commands: Commands) -> None:
     rig = add_command(
         commands,
         "rig",
-        "a whole rig: motors that move a virtual needle, and a tracker and a fibre that measure it",
+        "a whole rig: motors that move a virtual needle, and a tracker and sensors that measure it",
         _emulate_rig,
         "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
         "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
         about="Emulate the controller and tracker of a rig file, with the virtual phantom of a scenario "
-        "between them, and an FBGS stream if the scenario has a sensor of kind fbg, each in a process, until Ctrl-C "
-        "or SIGTERM. Prints one line when all are ready, and one per event. "
+        "between them, and an FBGS stream and an OpenIGTLink server if the scenario has such sensors along the needle, "
+        "each in a process, until Ctrl-C or SIGTERM. Prints one line when all are ready, and one per event. "
         "A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
     )
     rig.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
@@ -136,7 +136,7 @@ def _add_rig(commands: Commands) -> None:
         "--save",
         type=expand_home,
         metavar="FILE",
-        help="write the rig file with the addresses of the devices, and with the fibre, to a new file",
+        help="write the rig file with the addresses of the devices, and with the sensors, to a new file",
     )
     _add_fault(
         rig,

@@ -74,3 +74,27 @@ def test_a_step_with_a_sensor_along_the_needle_needs_no_tracker_but_none_that_co
     moving = watch.with_expectation(sensed, NOW, NOW + 1.0).with_readings(reading, NOW, VISIBLE)
     assert moving.permission.kind is kind
     assert not moving.with_expectation(AT_TIP, NOW, NOW + 1.0).permission.ok
+
+
+def in_field(settings, *, sensed, x=0.0):
+    """Return the permission in a step, a second after the field has become distorted; x: of the newest reading."""
+    expected = replace(AT_TIP, end=AT_TIP.begin, sensed=sensed)
+    watch = TipWatch(Monitor(settings), 0.25, NOW - 1.0).with_expectation(expected, NOW, NOW)
+    reference = SensorReading((0.0, 0.0, 0.0), indicator=0.3)
+    for k in range(41):
+        time = NOW + k / 40.0
+        here = measured(k, time, x if k == 40 else 1e-3 * k)
+        frame = replace(here.frame, readings={**here.frame.readings, "ref1": reference})
+        watch = watch.with_readings([replace(here, frame=frame)], time, VISIBLE)
+    return watch.permission.kind
+
+
+def test_a_distorted_field_holds_the_needle_unless_the_fit_knows_its_error():
+    """A reading that is bad by itself holds the needle in any case."""
+    known, unknown = (MonitorSettings(references=1, indicator_error_mm=error) for error in (9.6, 0.0))
+    assert in_field(known, sensed=True) is VerdictKind.OK
+    assert in_field(known, sensed=False) is VerdictKind.FIELD_DISTORTED
+    assert in_field(unknown, sensed=True) is VerdictKind.FIELD_DISTORTED
+    assert in_field(known, sensed=True, x=5.0) is VerdictKind.INNOVATION
+    assert in_field(known, sensed=True, x=math.nan) is VerdictKind.NOT_A_NUMBER
+    assert in_field(known.model_copy(update={"references": 2}), sensed=True) is VerdictKind.FIELD_UNKNOWN

@@ -15,12 +15,14 @@ from flexneedle.errors import InputError, RunError
 from flexneedle.lab.emulators import aurora_faults, fbgs
 from flexneedle.lab.emulators.aurora_server import SerialPort
 from flexneedle.lab.emulators.emulated_rig.fibre_part import address_of_fibre, section_of
+from flexneedle.lab.emulators.emulated_rig.images_part import address_of_images, sections_of
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.motors_part import address_of
 from flexneedle.lab.emulators.emulated_rig.tracker_part import port_of
 from flexneedle.lab.emulators.faults import FaultKind, parse_fault, parse_order
 from flexneedle.lab.emulators.galil import galil_server as galil
 from flexneedle.lab.emulators.orders import Orders
+from flexneedle.lab.igtl.settings import IgtlAddress
 from flexneedle.lab.process import ChildProcess
 
 DEVICES: Mapping[str, Mapping[str, FaultKind]] = {
@@ -30,8 +32,14 @@ DEVICES: Mapping[str, Mapping[str, FaultKind]] = {
 }
 """Kinds of fault by device."""
 
-_PHANTOM, _GALIL, _AURORA, _FBGS = "phantom", "galil", "aurora", "fbgs"
-_MODULES = {_PHANTOM: "phantom", _GALIL: "motors_part", _AURORA: "tracker_part", _FBGS: "fibre_part"}
+_PHANTOM, _GALIL, _AURORA, _FBGS, _IGTL = "phantom", "galil", "aurora", "fbgs", "igtl"
+_MODULES = {
+    _PHANTOM: "phantom",
+    _GALIL: "motors_part",
+    _AURORA: "tracker_part",
+    _FBGS: "fibre_part",
+    _IGTL: "images_part",
+}
 _END_S = 3.0  # for a process to end by itself
 _FOLLOW_S = 0.5  # a process that has lost another may end before it
 
@@ -58,19 +66,22 @@ def check_free(job: EmulationJob) -> None:
         stack.enter_context(galil.TcpServer(*address_of(rig)))
         if fibre is not None:
             stack.enter_context(fbgs.FbgsServer(*address_of_fibre(rig, fibre)))
+        IgtlAddress(*address_of_images(job)).require_free()
         stack.enter_context(SerialPort(Path(port_of(rig))))
     if job.save is not None and job.save.exists():
         raise InputError(f"{job.save}: already exists: choose another file, or remove it")
 
 
 def rig_values(job: EmulationJob, addresses: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values of the rig file with the addresses of the devices, and the fibre."""
+    """Return the values of the rig file with the addresses of the devices, and the sensors along the needle."""
     values = job.rig.model_dump(mode="json", exclude_unset=True)
     values["driver"]["address"], values["tracker"]["port"] = addresses[_GALIL], addresses[_AURORA]
+    sensors = {one["name"]: one for one in values.get("sensor", ())}
     if job.fibre is not None:
-        values["sensor"] = [one for one in values.get("sensor", ()) if one["name"] != job.fibre.title]
-        values["sensor"].append(section_of(job.fibre, addresses[_FBGS]))
-    return values
+        sensors[job.fibre.title] = section_of(job.fibre, addresses[_FBGS])
+    if job.images:
+        sensors |= {one["name"]: one for one in sections_of(job, addresses[_IGTL])}
+    return values | ({"sensor": list(sensors.values())} if sensors else {})
 
 
 class EmulatedRig:
@@ -88,10 +99,11 @@ class EmulatedRig:
         from_motors, to_phantom = socket.socketpair()
         from_phantom, to_tracker = socket.socketpair()
         ends = {_PHANTOM: (from_motors, to_tracker), _GALIL: (to_phantom,), _AURORA: (from_phantom,)}
-        if self._job.fibre is not None:
-            from_needle, to_fibre = socket.socketpair()
-            # Before the motors, whose records make the phantom send shapes.
-            ends = {_PHANTOM: (*ends.pop(_PHANTOM), to_fibre), _FBGS: (from_needle,), **ends}
+        for name, emulated in ((_FBGS, self._job.fibre is not None), (_IGTL, bool(self._job.images))):
+            if emulated:
+                from_needle, to_sensor = socket.socketpair()
+                # Before the motors, whose records make the phantom send shapes.
+                ends = {_PHANTOM: (*ends.pop(_PHANTOM), to_sensor), name: (from_needle,), **ends}
         try:
             addresses = {name: self._start(name, mine) for name, mine in ends.items()}
         except BaseException:
@@ -101,7 +113,7 @@ class EmulatedRig:
             for end in chain.from_iterable(ends.values()):
                 end.close()
         pids = {name: part.pid for name, part in self._parts.items()}
-        ready = {name: addresses[name] for name in DEVICES if name in addresses}
+        ready = {name: addresses[name] for name in (*DEVICES, _IGTL) if name in addresses}
         if self._job.save is not None:
             with self._job.save.open("x", encoding="utf-8") as file:
                 file.write(tomli_w.dumps(rig_values(self._job, ready)))

@@ -10,6 +10,8 @@ from flexneedle.planning.origin import check_origin, with_planned_entry
 from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.fbg import Fbg
+from flexneedle.scenario.sensors.points import Points
+from flexneedle.scenario.sensors.slice import Slice
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,11 @@ class EmulationJob:
         """The fibre with gratings in the needle, None without one."""
         return next((one for one in self.scenario.sensor if isinstance(one, Fbg)), None)
 
+    @property
+    def images(self) -> tuple[Slice | Points, ...]:
+        """The sensors along the needle that images are."""
+        return tuple(one for one in self.scenario.sensor if isinstance(one, Slice | Points))
+
     def faults_of(self, device: str) -> list[str]:
         """Return the texts of the scheduled faults of a device."""
         return [text for name, text in self.faults if name == device]
@@ -48,9 +55,9 @@ def make_job(
 ) -> EmulationJob:
     """Return the job of a rig, a scenario, and the record of a plan, of an insertion or None.
 
-    Raises InputError if it cannot be emulated: devices of another kind, a tracker in an environment, an entry that is
-    free without a plan, several plans, one of another scenario, or several fibres; RigError for axes that the phantom
-    cannot have.
+    Raises InputError if it cannot be emulated: devices or sensors of another kind, a tracker in an environment, an
+    entry that is free without a plan, several plans, one of another scenario, or several fibres; RigError for axes that
+    the phantom cannot have.
     """
     for part, kind in (("driver", "galil"), ("tracker", "aurora")):
         if (given := getattr(rig, part).kind) != kind:
@@ -73,6 +80,11 @@ def make_job(
     job = EmulationJob(rig, scenario, seed, truth, faults, save)
     if sum(isinstance(one, Fbg) for one in scenario.sensor) > 1:
         raise InputError("sensor: an emulated rig has one sensor of kind fbg; leave the others out")
+    for one in scenario.sensor:
+        if not isinstance(one, Fbg | Slice | Points):
+            raise InputError(
+                f'sensor {one.title}: kind = "{one.kind}": must be fbg, slice or points to be emulated; leave it out'
+            )
     if job.fibre is None and job.faults_of("fbgs"):
         raise InputError("--fault fbgs: the scenario has no sensor of kind fbg")
     return job

@@ -1,6 +1,7 @@
 """Phantom of an emulated rig: a process in which the true needle follows the motors.
 
-`python -m flexneedle.lab.emulators.emulated_rig.phantom PARENT MOTORS TRACKER [FIBRE]`, with descriptors of channels.
+`python -m flexneedle.lab.emulators.emulated_rig.phantom PARENT MOTORS TRACKER [FIBRE] [IMAGES]`, with descriptors of
+channels.
 """
 
 import gc
@@ -51,8 +52,8 @@ def make_sensor(job: EmulationJob, truth: Truth) -> PhantomSensor:
 class EmulatedPhantom:
     """The true needle, moved by the records of the motors.
 
-    tracker: channel for the poses of the tip; truth: writer of the true states, or None; note: reports a line; fibre:
-    channel for the shapes of the needle, or None.
+    tracker: channel for the poses of the tip; truth: writer of the true states, or None; note: reports a line;
+    shapes: channels for the shapes of the needle.
     """
 
     def __init__(
@@ -61,14 +62,14 @@ class EmulatedPhantom:
         tracker: MessageChannel,
         truth: TruthWriter | None,
         note: Callable[[str], None],
-        fibre: MessageChannel | None = None,
+        *shapes: MessageChannel,
     ) -> None:
         self._carriages, self._channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
         self._positions = start_positions(self._carriages)
         drawn_truth = draw_phantom(job)
         self._needle = DrivenNeedle(drawn_truth, self._positions)
         self._sensor, self._truth = make_sensor(job, drawn_truth), truth
-        self._tracker, self._note, self._fibre = tracker, note, fibre
+        self._tracker, self._note, self._shapes = tracker, note, shapes
         self._seen, self._shape = self._sensor.at(self._needle.tip), self._needle.shape
         self._lags: deque[float] = deque(maxlen=_KEPT)
         self._steps, self._warned, self._failed = 0, -_WARN_S, False
@@ -84,8 +85,8 @@ class EmulatedPhantom:
             self._steps += parts
             self._seen, self._shape = self._sensor.at(self._needle.tip), self._needle.shape
         send_record(self._tracker, record._replace(values=tuple(self._seen)), "tracker")
-        if self._fibre is not None:
-            send_record(self._fibre, record._replace(values=self._shape), "fibre")
+        for channel in self._shapes:
+            send_record(channel, record._replace(values=self._shape), "sensor along the needle")
         lag = monotonic() - record.time
         if self._truth is not None:
             self._truth.write(self._row(record, lag))
@@ -125,12 +126,12 @@ class EmulatedPhantom:
 
 def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:
     """Follow the motors until they or the parent end."""
-    motors, tracker, *fibre = channels
+    motors, tracker, *shapes = channels
     with ExitStack() as stack:
         axes = [name for name, _ in job.rig.axes.items()]
         truth = None if job.truth is None else stack.enter_context(TruthWriter(job.truth, axes))
         compile_kernels(job.scenario.setup.axes)  # not while the motors turn
-        world = EmulatedPhantom(job, tracker, truth, parent.note, *fibre)
+        world = EmulatedPhantom(job, tracker, truth, parent.note, *shapes)
         world.begin()
         gc.collect()
         gc.freeze()

@@ -13,14 +13,16 @@ from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKi
 
 _NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # never good, whatever is expected
 _LOST = (VerdictKind.MISSING, VerdictKind.STALE)  # nothing against what is expected
+_DISTORTED = (VerdictKind.FIELD_DISTORTED,)  # readings count with an error that the closed loop knows
 
 
 @dataclass(frozen=True)
 class TipWatch:
-    """State of the check: the monitor, the expectation from `begun` to `ended` (s), and the last verdict.
+    """State of the check: the monitor, the expectation from `begun` to `ended` (s), and the last verdicts.
 
     Before and after these times the tip is expected at rest. since: time of the newest readings, at first the begin
-    of the watch. Each change returns a new state.
+    of the watch; verdict: on the readings; field: verdict on the field, since the first step. Each change returns a new
+    state.
     """
 
     monitor: Monitor
@@ -31,6 +33,7 @@ class TipWatch:
     ended: float = 0.0
     newest: Measurement | None = None
     verdict: Verdict = OK
+    field: Verdict = OK
 
     def with_expectation(self, expected: Expectation, begun: float, ended: float) -> "TipWatch":
         """Return the watch with another expectation; after an innovation it judges the newest reading again."""
@@ -44,9 +47,14 @@ class TipWatch:
 
     @property
     def permission(self) -> Verdict:
-        """The verdict; OK if the tracker is only lost, and a sensor along the needle measures it."""
-        sensed = self.expected is not None and self.expected.sensed
-        return OK if sensed and self.verdict.kind in _LOST else self.verdict
+        """The verdict on field or readings that holds the needle, else OK.
+
+        With a sensor along the needle that measures it, a lost tracker does not, nor a distorted field if the scenario
+        has the error of readings by the indicators.
+        """
+        known = _DISTORTED if self.monitor.settings.indicator_error_mm > 0.0 else ()
+        excused = (*_LOST, *known) if self.expected is not None and self.expected.sensed else ()
+        return rules.first_bad(one for one in (self.field, self.verdict) if one.kind not in excused)
 
     def with_later_end(self, now: float, seconds: float) -> "TipWatch":
         """Extend the expected motion by `seconds`."""
@@ -70,8 +78,8 @@ class TipWatch:
                 verdict = OK
         if measurements:
             monitor, field = monitor.check_field()
-            verdict = field if not field.ok else verdict
-            return replace(self, monitor=monitor, verdict=verdict, newest=measurements[-1], since=now)
+            newest = measurements[-1]
+            return replace(self, monitor=monitor, verdict=verdict, field=field, newest=newest, since=now)
         return replace(self, verdict=self._verdict_without_readings(now, status))
 
     def _with_first_readings(self, measurements: Sequence[Measurement], now: float) -> "TipWatch":
