@@ -68,7 +68,7 @@ def reading(message, sensor=POINTS, registration=None):
 )
 def test_points_without_an_image_are_in_the_needles_frame(message, sensor, rows):
     found = reading(message, sensor)
-    assert (found.time, found.rows, found.status) == (5.0, rows, VISIBLE)
+    assert (found.time, found.rows, found.status) == (5.0 - sensor.delay_s, rows, VISIBLE)
 
 
 def test_points_are_placed_where_a_target_would_be():

@@ -163,7 +163,7 @@ class Node:
 
 def fbg(*records, **mounting):
     sites = SiteMap(POSITIONS["positions_mm"], FBG.sites_mm, GratingSettings(**POSITIONS, **mounting))
-    return RosFbg(Node(*records), WallClock(), 60.0, "sensors.curvatures", sites, 0.02)
+    return RosFbg(Node(*records), WallClock(), 60.0, "sensors.curvatures", 0.02, sites)
 
 
 def test_curvatures_at_gratings_become_those_at_sites():
@@ -196,7 +196,7 @@ def test_a_grating_without_a_value_leaves_its_sites_without_one(rows, sites, sta
 
 def test_the_status_is_the_reason_why_no_reading_arrives():
     node = Node(Reading(time.monotonic(), ((1.0, 2.0, 3.0),)))
-    sensor = RosSensor(node, WallClock(), 0.0, "sensors.points")
+    sensor = RosSensor(node, WallClock(), 0.0, "sensors.points", 0.0)
     assert [one.rows for one in sensor.read()] == [((1.0, 2.0, 3.0),)]
     assert sensor.status.startswith("no reading for ")
     node.obstacles = {"sensors.points": "a publisher has the type a/msg/B, which is not received"}

@@ -51,7 +51,7 @@ class PointsReader(MessageReader[Reading]):
     ) -> None:
         super().__init__(settings)
         self._is_slice = isinstance(sensor, Slice)
-        self._delay = 0.0 if settings.stamps else sensor.delay_s
+        self._delay = sensor.delay_s  # of the message with the least delay, if stamps are used
         self._image, self._own, self._wrong = settings.registration, registration, ""
 
     def read(self, message: Message, peer: str, arrival: float, connected: bool) -> Reading | None:

@@ -1,7 +1,8 @@
 """The sensor `ros`: curvatures of a fibre, points along the needle, or one point, on a topic.
 
-Points have the time of the stamp in the header. Curvatures have no header: their time is the stamp with which the
-publisher's DDS sent them, less the scenario's `delay_s`. Both are corrected by the least delay (`link.stamps`).
+Points have a stamp in the header. Curvatures have no header: theirs is the stamp with which the publisher's DDS sent
+them. The clock of stamps is known from the message that arrived with the least delay (`link.stamps`), and this delay is
+the scenario's `delay_s`.
 """
 
 from collections.abc import Mapping
@@ -55,9 +56,9 @@ class RosSensor(TopicReceiver[Reading]):
 
     noun = "reading"
 
-    def __init__(self, node: NodeClient, clock: Clock, late_s: float, key: str) -> None:
+    def __init__(self, node: NodeClient, clock: Clock, late_s: float, key: str, delay: float) -> None:
         super().__init__(node, clock, late_s)
-        self._key = key
+        self._key, self._delay = key, delay
 
     def _explain(self, silent: float) -> str:
         return self._refused or self._node.obstacles.get(self._key) or super()._explain(silent)
@@ -65,17 +66,17 @@ class RosSensor(TopicReceiver[Reading]):
     def _make(self, record: Received) -> Reading | None:
         if not isinstance(record, Reading):
             return None
-        return Reading(record.time + self._offset, record.rows, record.status)
+        return Reading(record.time + self._offset - self._delay, record.rows, record.status)
 
 
 class RosFbg(RosSensor):
     """The port `NeedleSensor` of curvatures on the topic `key` of a node."""
 
     def __init__(
-        self, node: NodeClient, clock: Clock, late_s: float, key: str, sites: SiteMap, delay: float
+        self, node: NodeClient, clock: Clock, late_s: float, key: str, delay: float, sites: SiteMap
     ) -> None:
-        super().__init__(node, clock, late_s, key)
-        self._map, self._delay = sites, delay
+        super().__init__(node, clock, late_s, key, delay)
+        self._map = sites
 
     def _make(self, record: Received) -> Reading | None:
         if not isinstance(record, Reading):
@@ -120,5 +121,5 @@ def make_sensor(settings: Mapping[str, Any], clock: Clock, sensor: Sensor) -> Ro
     key, late = f"sensors.{name}", find_late_s(given.late_ms, sensor.rate_hz)
     if isinstance(sensor, Fbg) and isinstance(given, RosFbgSettings):
         sites = SiteMap(given.positions_mm, sensor.sites_mm, given)
-        return RosFbg(NodeClient(profile), clock, late, key, sites, sensor.delay_s)
-    return RosSensor(NodeClient(profile), clock, late, key)
+        return RosFbg(NodeClient(profile), clock, late, key, sensor.delay_s, sites)
+    return RosSensor(NodeClient(profile), clock, late, key, sensor.delay_s)
