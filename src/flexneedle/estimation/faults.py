@@ -101,7 +101,7 @@ def _find_fault(rows: _Rows, weighted: Floats, precision: Floats, size: float, d
 
 
 def _spread(growth: Floats, values: NDArray[np.intp]) -> Floats:
-    """Return the square root (n, g · v) of the covariance of errors, from that of one value (n, g); values: (n,)."""
+    """Return the square root (n, g · v) of the covariance of errors, from one value's (n, g); values: (n,)."""
     own = values[:, None] == np.unique(values)
     spread: Floats = (growth[:, :, None] * own[:, None]).reshape(len(growth), -1)
     return spread
