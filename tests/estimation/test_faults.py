@@ -1,6 +1,5 @@
 """Faults of sensors, found by the readings of all."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -19,15 +18,14 @@ def test_the_odds_are_the_ratio_of_the_densities_of_the_readings():
     places, value = np.repeat(np.linspace(2.0, 29.0, 7), 3), np.tile(np.arange(3), 7)
     root = rng.normal(size=(21, 30))
     covariance, left = root @ root.T / 30.0, rng.normal(size=21)
-    rows = faults._Rows(places, left, np.zeros((21, 0)), np.ones(21), value, 1, np.zeros((21, 0)))
     precision = np.linalg.inv(covariance)
-    found = faults._find_fault(rows, precision @ left, precision, size, depth)
+    found = faults._find_fault(places, value, precision @ left, precision, size, depth)
     plain, known = multivariate_normal.logpdf(left, cov=covariance), []
     for since in (25.0, 20.0, 10.0, 0.0):
         way = np.maximum(0.0, places - since) / 40.0
         shapes = (np.minimum(way[:, None], way), way[:, None] * way)
-        for shape, same in itertools.product(shapes, (value[:, None] == value, 1.0)):
-            error = size**2 * shape * same
+        for shape in shapes:
+            error = size**2 * shape * (value[:, None] == value)
             known.append((multivariate_normal.logpdf(left, cov=covariance + error) - plain, since))
     assert found == pytest.approx(max(known))
 

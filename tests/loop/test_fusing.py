@@ -163,15 +163,14 @@ def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
 @pytest.mark.parametrize(
     ("odds", "faulty", "held"),
     [
-        ({"tracker": 2.0, "fbg": 6.0}, "", False),
-        ({"tracker": 2.0, "fbg": 8.0}, "fbg", False),
+        ({"tracker": 2.0, "fbg": 8.0}, "", False),
+        ({"tracker": 2.0, "fbg": 10.0}, "fbg", False),
         ({"tracker": 9.0, "fbg": 13.0}, "fbg", False),
-        ({"tracker": 4.0, "fbg": 7.5}, "fbg", False),
-        ({"tracker": 4.0, "fbg": 6.0}, "", True),  # one of them
-        ({"tracker": 4.0, "fbg": 0.5}, "tracker", True),
-        ({"tracker": 1.0, "a": 2.0, "b": 9.0}, "b", False),
-        ({"tracker": 8.0}, "tracker", True),
-        ({"fbg": 9.0}, "fbg", False),
+        ({"tracker": 10.0, "fbg": 11.0}, "", True),  # one of them
+        ({"tracker": 10.0, "fbg": 0.5}, "tracker", True),
+        ({"tracker": 1.0, "a": 2.0, "b": 10.0}, "b", False),
+        ({"tracker": 10.0}, "tracker", True),
+        ({"fbg": 10.0}, "fbg", False),
         ({}, "", False),
     ],
 )

@@ -8,12 +8,12 @@ the generalised likelihood ratio for a change of unknown time (Willsky and Jones
 After a leap of the needle the model is late. So the tracker's own evidence against the model is no evidence of its
 fault and is subtracted, as is the evidence of a sensor beside which no other measures.
 
-The model's error lasts from move to move, so that the readings are averaged over some moves, whose means have its whole
-variance.
+The model's error lasts over some moves, and is correlated as e^(−moves/length). Readings are averaged over so many
+moves, the last ones over few.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,8 @@ from flexneedle.estimation.fitted import LASTING, TRACKER, FittedInsertion
 from flexneedle.types import Flags, Floats, X
 
 _ONSETS_MM = (5.0, 10.0, 20.0, np.inf)  # above the tip
+_FEW = 2  # moves over which the last readings are averaged
+_DOUBT = 2.0  # factor on the model's error for faults of single values, which are as varied as this error is
 _BESIDE_MM = 10.0  # above the tip, where another sensor measured
 _GROWTH_MM = 40.0  # depth over which a fault grows
 _SIZE = 1.5  # to this many standard deviations of a sensor's noise or offset
@@ -42,10 +44,17 @@ class _Rows(NamedTuple):
     depth: Floats  # of the tip (n,), mm
     left: Floats  # (n,)
     jacobian: Floats  # (n, K)
-    variance: Floats  # of noise and model error (n,)
+    variance: Floats  # of the noise (n,)
+    model: Floats  # standard deviation of the model's error (n,)
+    move: Floats  # mean number of the move (n,)
     value: NDArray[np.intp]  # number (n,) of the value in a reading
     across: int  # number of values of a lateral pair or of a single value
     shares: Floats  # weights (n, b) of the moves in the means
+
+    @property
+    def is_common(self) -> bool:
+        """True if its values are one lateral pair, or one value."""
+        return bool((self.value < self.across).all())
 
 
 def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
@@ -59,41 +68,72 @@ def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
     )
     left = left + jacobian @ (fitted.parameters - fitted.prior.mean)
     covariance = jacobian @ fitted.prior.covariance @ jacobian.T + np.diag(variance)
+    ends = np.cumsum([0, *(one.left.size for one in rows.values())])
+    places = {name: slice(*each) for name, each in zip(rows, itertools.pairwise(ends), strict=True)}
+    error = np.zeros_like(covariance)
+    for name, one in rows.items():
+        lasting = np.exp(-np.abs(one.move[:, None] - one.move) / LASTING) * _is_same(one.value)
+        error[places[name], places[name]] = np.multiply.outer(one.model, one.model) * lasting
     if fitted.has_field and TRACKER in rows:
         tip = rows[TRACKER]
-        own = slice(tip.left.size)  # the first rows
+        own = places[TRACKER]
         covariance[own, own] += _is_same(tip.value) * (tip.shares @ field_covariance(fitted) @ tip.shares.T)
-    precision = np.linalg.inv(covariance)
-    weighted, begin, found = precision @ left, 0, {}
-    depth = float(fitted.tips[-1, X])
+    common = _compute_all(fitted, rows, places, left, covariance + error, single=False)
+    if all(one.is_common for one in rows.values()):
+        return common
+    single = _compute_all(fitted, rows, places, left, covariance + _DOUBT**2 * error, single=True)
+    return {name: max(common[name], single[name]) for name in common}
+
+
+def _compute_all(
+    fitted: FittedInsertion,
+    rows: Mapping[str, _Rows],
+    places: Mapping[str, slice],
+    left: Floats,
+    covariance: Floats,
+    *,
+    single: bool,
+) -> dict[str, Fault]:
+    """Return the likeliest faults, of single values or of all together; of residuals (n,) with this covariance."""
+    precision: Floats = np.linalg.inv(covariance)
+    weighted, depth = precision @ left, float(fitted.tips[-1, X])
+    found = {}
     for name, one in rows.items():
-        own, size = slice(begin, begin + one.left.size), _size(fitted, name)
-        found[name] = _find_fault(one, weighted[own], precision[own, own], size, depth)
+        own, size = places[name], _size(fitted, name)
+        value = one.value if single else one.value % one.across
+        found[name] = _find_fault(one.depth, value, weighted[own], precision[own, own], size, depth)
         others = [other.depth.max() for key, other in rows.items() if key != name]
         if name == TRACKER or max(others, default=-np.inf) < depth - _BESIDE_MM:
-            alone = np.linalg.inv(covariance[own, own])
-            against_model = _find_fault(one, alone @ left[own], alone, size, depth).log_odds
-            found[name] = found[name]._replace(log_odds=found[name].log_odds - max(0.0, against_model))
-        begin = own.stop
+            alone: Floats = np.linalg.inv(covariance[own, own])
+            by_itself = _find_fault(one.depth, value, alone @ left[own], alone, size, depth)
+            found[name] = found[name]._replace(log_odds=found[name].log_odds - max(0.0, by_itself.log_odds))
     return found
 
 
-def _find_fault(rows: _Rows, weighted: Floats, precision: Floats, size: float, depth: float) -> Fault:
-    """Return the likeliest fault of a sensor; size: to which it grows.
+def _find_fault(
+    places: Floats,
+    value: NDArray[np.intp],
+    weighted: Floats,
+    precision: Floats,
+    size: float,
+    depth: float,
+) -> Fault:
+    """Return the likeliest fault of a sensor with residuals (n,); size: to which it grows.
 
+    places: depths (n,), mm, of the tip, which now is at `depth`; value (n,): residuals with the same number err alike;
     weighted, precision: the sensor's parts of C⁻¹ r (n,) and C⁻¹ (n, n), of all residuals r with the covariance C.
     """
-    found, common = [Fault(-np.inf, depth)], rows.value % rows.across
-    for back in _ONSETS_MM:
+    found = [Fault(-np.inf, depth)]
+    for back in _ONSETS_MM if depth > _ONSETS_MM[0] else ():  # the fit is late where the needle enters
         since = max(0.0, depth - back)
-        late = np.flatnonzero(rows.depth > since)
+        late = np.flatnonzero(places > since)
         if late.size:
-            way = (rows.depth[late] - since) / _GROWTH_MM
+            way = (places[late] - since) / _GROWTH_MM
             inner = precision[np.ix_(late, late)]
             steps = np.unique(way)
             walk = np.sqrt(np.diff(steps, prepend=0.0)) * (way[:, None] >= steps)
-            for growth, values in itertools.product((walk, way[:, None]), (rows.value, common)):
-                odds = _compute_log_odds(size * _spread(growth, values[late]), weighted[late], inner)
+            for growth in (walk, way[:, None]):
+                odds = _compute_log_odds(size * _spread(growth, value[late]), weighted[late], inner)
                 found.append(Fault(odds, since))
         if since == 0.0:
             break
@@ -139,6 +179,7 @@ def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
         TRACKER,
         _average(
             position.index,
+            len(fitted.moves) - 1,
             position.between(fitted.tips[:, X]),
             np.stack([part(left) for part in across], axis=1),
             np.stack([part(jacobian) for part in across], axis=1),
@@ -158,6 +199,7 @@ def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
             one.name,
             _average(
                 bins.index,
+                len(fitted.moves) - 1,
                 depth,
                 one.in_its_axes(fitted.along_residuals[k], bins),
                 one.in_its_axes(jacobian.transpose(2, 0, 1), bins).transpose(1, 2, 0),
@@ -170,6 +212,7 @@ def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
 
 def _average(
     index: NDArray[np.intp],
+    newest: int,
     depth: Floats,
     left: Floats,
     jacobian: Floats,
@@ -177,22 +220,24 @@ def _average(
     model: Floats,
     across: int,
 ) -> _Rows:
-    """Return the means over some moves each of residuals (b, d) in moves (b,).
+    """Return the means over some moves each of residuals (b, d) in moves (b,), of which `newest` is the last.
 
     depth: (b,), mm; jacobian: (b, d, K); noise, model: variances (b, d) of the residuals and of the model's error, NaN
     where nothing was measured.
     """
-    groups = index // LASTING
+    age = newest - index
+    groups = np.where(age < LASTING, age // _FEW, LASTING + age // LASTING)
     shares = (groups == np.unique(groups)[:, None])[:, None, :] & np.isfinite(noise).T  # (g, d, b)
     counts = shares.sum(axis=2)
     seen = counts > 0
     weights = shares / np.maximum(counts, 1)[:, :, None]
-    level = np.nan_to_num(noise)
     return _Rows(
-        np.broadcast_to((weights @ depth), counts.shape)[seen],
+        (weights @ depth)[seen],
         np.einsum("gdb,bd->gd", weights, left)[seen],
         np.einsum("gdb,bdk->gdk", weights, jacobian)[seen],
-        (np.einsum("gdb,bd->gd", weights**2, level) + np.einsum("gdb,bd->gd", weights, model))[seen],
+        np.einsum("gdb,bd->gd", weights**2, np.nan_to_num(noise))[seen],
+        np.sqrt(np.einsum("gdb,bd->gd", weights, model))[seen],
+        (weights @ index)[seen],
         np.broadcast_to(np.arange(counts.shape[1]), counts.shape)[seen],
         across,
         weights[seen],

@@ -22,8 +22,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_FAULTY = 6.0  # ln of the Bayes factor, from which a sensor is faulty
-_IN_DOUBT = 3.0  # from which the tracker may be: then the needle is held
+_FAULTY = 9.0  # ln of the Bayes factor, from which there is a fault
 _CLEAR = 3.0  # by which a fault must be likelier than another
 
 
@@ -133,8 +132,6 @@ def exclude_faulty(
 def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
     """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
-    A wrong exclusion leaves the tracker alone, and a hold harms nobody: so a fault of the tracker needs less.
-
     faults: the likeliest of each sensor by name.
     """
     odds = {name: one.log_odds for name, one in faults.items()}
@@ -144,8 +141,8 @@ def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
         return name, Verdict(
             VerdictKind.CONTRADICTED, f"ln of the odds of a fault is {most:.1f}, limit {_FAULTY:g}"
         )
-    if tip > _IN_DOUBT and most - tip < _CLEAR:
-        reason = f"{TRACKER}: ln of the odds of a fault is {tip:.1f}, limit {_IN_DOUBT:g}"
+    if tip > _FAULTY:
+        reason = f"{TRACKER}: ln of the odds of a fault is {tip:.1f}, limit {_FAULTY:g}"
         if tip - most > _CLEAR:
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
         return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
