@@ -22,29 +22,6 @@ _CORRECTS = ("fbgs", "interrogator")  # devices with the keys gain and turn_deg
 
 
 @dataclass(frozen=True)
-class Keys:
-    """Keys of a kind for its noise and for the prior of its offset, and their unit, `scale` of which are one inside."""
-
-    noise: str = ""
-    offset: str = ""
-    unit: str = ""
-    scale: float = 1.0
-
-
-_KEYS = {
-    "fbg": Keys("noise_per_m", "bias_per_m", "1/m", 1e3),
-    "slice": Keys("noise_mm", "pose_sd_mm", "mm"),
-    "points": Keys("noise_mm", "place_sd_mm", "mm"),
-    "view": Keys("noise_px", "pose_sd_px", "px"),
-}
-
-
-def keys_of(sensor: Sensor) -> Keys:
-    """Return the keys of the kind of a sensor, without names for a kind that is not included."""
-    return _KEYS.get(sensor.kind, Keys())
-
-
-@dataclass(frozen=True)
 class SensorError:
     """An error of a sensor as found in air.
 
@@ -96,7 +73,7 @@ class _SensorCheck:
         self._fit, self._number, self._rig = fit, number, rig
         self._one: SensorFit = fit.model.sensors[number]
         self._sensor: Sensor = self._one.sensor
-        self._keys = keys_of(self._sensor)
+        self._keys = self._sensor.keys
         self._readings: Sequence[Reading] = fit.model.run.readings[self._one.name]
         scenario = fit.model.simulator.scenario
         self._by = "the tracker" if fit.model.run.measurements else "the motors"
@@ -198,21 +175,21 @@ class _SensorCheck:
         value, sd = max(each, key=lambda one: abs(one[0]) / math.hypot(one[1], allowed or 1.0))
         line = ""
         if self._is_off("offset", value, sd, allowed) and keys.offset:
-            line = f"{keys.offset} = {keys.scale * abs(value):.2g}"
+            line = f"{keys.offset} = {abs(value) / keys.size:.2g}"
         note = f"largest of {len(each)}" + (", with the natural bend" if self._sensor.rolls else "")
-        shown = f"± {keys.scale * allowed:.3g} {keys.unit}".rstrip()
+        shown = f"± {allowed / keys.size:.3g} {keys.unit}".rstrip()
         where = "scenario" if line else ""
-        return self._error("offset", keys.scale * value, keys.scale * sd, keys.unit, shown, note, where, line)
+        return self._error("offset", value / keys.size, sd / keys.size, keys.unit, shown, note, where, line)
 
     def _readings_errors(self) -> Iterator[SensorError]:
         """Yield noise, rate, and lost and outlying readings."""
         sensor, keys = self._sensor, self._keys
         noise, times = self._fit.noise[self._number], [one.time for one in self._readings]
         off = not 1.0 / _NOISE < noise / sensor.noise < _NOISE
-        line = f"{keys.noise} = {keys.scale * noise:.2g}" if off and keys.noise else ""
-        shown = f"{keys.scale * sensor.noise:.3g} {keys.unit}".rstrip()
+        line = f"{keys.noise} = {noise / keys.size:.2g}" if off and keys.noise else ""
+        shown = f"{sensor.noise / keys.size:.3g} {keys.unit}".rstrip()
         yield self._error(
-            "noise", keys.scale * noise, 0.0, keys.unit, shown, "", "scenario" if line else "", line
+            "noise", noise / keys.size, 0.0, keys.unit, shown, "", "scenario" if line else "", line
         )
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         line = "" if 1.0 / _RATE < rate / sensor.rate_hz < _RATE else f"rate_hz = {rate:.3g}"
