@@ -15,16 +15,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from flexneedle.errors import InputError
-from flexneedle.lab.emulators.faults import (
-    SECONDS,
-    Fault,
-    FaultKind,
-    FaultSchedule,
-    damage_reply,
-    is_order,
-    reply_time,
-)
+from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, FaultSchedule, damage_reply, reply_time
 from flexneedle.lab.emulators.galil.galil_server import TcpServer
 from flexneedle.lab.emulators.orders import OrderSource
 from flexneedle.types import Floats
@@ -196,13 +187,3 @@ def advance(session: FbgsSession, tcp: FbgsServer, now: float, say: Callable[[st
         session.schedule.since = now
     for data in session.take_due(now):
         tcp.send(data)
-
-
-def execute(session: FbgsSession, order: str) -> str:
-    """Inject the fault in a line; return a message about it, or the error."""
-    try:
-        if not is_order(order):
-            raise InputError(f"{order.strip()!r}: must be fault KIND[=DETAIL][:DURATION], or clear")
-        return f"{session.schedule.obey(order, monotonic())} from now on"
-    except InputError as error:
-        return str(error)
