@@ -9,10 +9,7 @@ from flexneedle.types import Measurement, Motion, Reading
 
 SITES = (70.0, 105.0, 140.0)
 SCENARIO = load_scenario("phantom3d").with_values(
-    {
-        "setup.guide_clearance_mm": 0.0,
-        "sensor": [{"kind": "fbg", "sites_mm": list(SITES)}],
-    }
+    {"setup.guide_clearance_mm": 0.0, "sensor": [{"kind": "fbg", "sites_mm": list(SITES)}]}
 )
 _LENGTH, _SPAN, _START = 150.0, 137.5, -28.5
 
