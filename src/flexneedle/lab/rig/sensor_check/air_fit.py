@@ -95,9 +95,9 @@ class AirModel:
         for sensor in (one for one in scenario.sensor if one.title in names):
             sensor_slots, more = wide_priors(sensor, axes, len(sds))
             sds += more
-            size = sensor.size(axes)
-            none = np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
-            sensors.append(SensorFit(sensor, sensor_slots, axes, size, np.zeros(0), *none))
+            size, empty = sensor.size(axes), np.zeros(0)
+            none = empty, np.zeros((0, size)), empty.astype(bool)
+            sensors.append(SensorFit(sensor, sensor_slots, axes, size, empty, *none))
         line = Timeline.of(run.moves, 0.0)
         tips = np.array([(one.time, one.x, one.y, one.z or 0.0) for one in run.measurements]).reshape(-1, 4)
         tips = tips[~rolling(line, tips[:, 0])]
@@ -208,7 +208,6 @@ class AirFit:
     model: AirModel
     parameters: Floats  # (K,)
     covariance: Floats  # (K, K)
-    tip_residual: Floats  # (r, 1 + a), mm
     predicted: list[Floats]  # by sensor (r, d)
     used: list[Flags]  # by sensor (r, d)
     noise: list[float]  # of each sensor, as seen
@@ -250,23 +249,21 @@ def fit_in_air(scenario: Scenario, run: AirRun, names: Collection[str] | None = 
     """
     model = AirModel.of(scenario, run, [one.title for one in scenario.sensor] if names is None else names)
     ends = model.quantities(model.simulate([model.mean])[1][0])
-    profiles = [_Profile.of(model, one, each) for one, each in zip(model.sensors, ends, strict=True)]
+    starts = [_find_start(model, one, each) for one, each in zip(model.sensors, ends, strict=True)]
     start = model.mean.copy()
-    for one, profile in zip(model.sensors, profiles, strict=True):
-        start[one.slots.clock] = profile.clock
+    for one, (clock, turn, _) in zip(model.sensors, starts, strict=True):
+        start[one.slots.clock] = clock
         if one.slots.turn is not None:
-            start[one.slots.turn] = profile.turn
+            start[one.slots.turn] = turn
     seen = [np.isfinite(one.value) for one in model.sensors]
-    first = _fit(model, start, seen, [one.sensor.noise for one in model.sensors])
-    residuals = [one.value - each for one, each in zip(model.sensors, first.predicted, strict=True)]
+    first, _, predicted = _fit(model, start, seen, [one.sensor.noise for one in model.sensors])
+    residuals = [one.value - each for one, each in zip(model.sensors, predicted, strict=True)]
     noise = [_scatter(left) or one.sensor.noise for left, one in zip(residuals, model.sensors, strict=True)]
     used = [np.abs(left) < _OUTLIER * sd for left, sd in zip(residuals, noise, strict=True)]
     moves = [model.line.at(one.time)[0] for one in model.sensors]
     each = zip(noise, residuals, used, moves, strict=True)
-    fitted = _fit(
-        model, first.parameters, used, [sd * _excess(left / sd, use, move) for sd, left, use, move in each]
-    )
-    return replace(fitted, noise=noise, profile_sds=[profile.sd for profile in profiles])
+    scaled = [sd * _excess(left / sd, use, move) for sd, left, use, move in each]
+    return AirFit(model, *_fit(model, first, used, scaled), used, noise, [sd for _, _, sd in starts])
 
 
 def _scatter(left: Floats) -> float:
@@ -287,28 +284,22 @@ def _excess(left: Floats, used: Flags, move: NDArray[np.intp]) -> float:
     return max(1.0, float(np.sqrt(squares.mean()))) if squares.size else 1.0
 
 
-@dataclass(frozen=True)
-class _Profile:
-    """Clock errors (s) of a sensor on a grid with the cost of the best other errors, and the best of them."""
+def _find_start(model: AirModel, one: SensorFit, ends: Floats) -> tuple[float, float, float]:
+    """Return the best clock error (s) and turn (rad) of a sensor, and the clock error's sd with all minima of the cost.
 
-    clock: float = 0.0
-    turn: float = 0.0  # rad
-    sd: float = CLOCK_SD  # of the clock error, with all of its minima (s)
-
-    @staticmethod
-    def of(model: AirModel, one: SensorFit, ends: Floats) -> "_Profile":
-        """Return the profile of a sensor; ends: its quantities at the ends of the moves, for the prior's needle."""
-        seen = np.isfinite(one.value).any(axis=1)
-        if not seen.any():
-            return _Profile()
-        known = replace(one, time=one.time[seen], value=one.value[seen])
-        grid = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _GRID_S) + 1)
-        costs, turns = np.transpose([_regress(model, known, ends, clock) for clock in grid])
-        density = np.exp(-0.5 * ((costs - costs.min()) / one.sensor.noise**2 + (grid / CLOCK_SD) ** 2))
-        density /= density.sum()
-        best = int(np.argmin(costs))
-        sd = math.sqrt(density @ (grid - density @ grid) ** 2)
-        return _Profile(float(grid[best]), float(turns[best]), sd)
+    Each clock error on a grid has the best other errors; ends: the sensor's quantities at the ends of the moves, for
+    the prior's needle.
+    """
+    seen = np.isfinite(one.value).any(axis=1)
+    if not seen.any():
+        return 0.0, 0.0, CLOCK_SD
+    known = replace(one, time=one.time[seen], value=one.value[seen])
+    grid = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _GRID_S) + 1)
+    costs, turns = np.transpose([_regress(model, known, ends, clock) for clock in grid])
+    density = np.exp(-0.5 * ((costs - costs.min()) / one.sensor.noise**2 + (grid / CLOCK_SD) ** 2))
+    density /= density.sum()
+    best = int(np.argmin(costs))
+    return float(grid[best]), float(turns[best]), math.sqrt(density @ (grid - density @ grid) ** 2)
 
 
 def _regress(model: AirModel, one: SensorFit, ends: Floats, clock: float) -> tuple[float, float]:
@@ -331,8 +322,10 @@ def _regress(model: AirModel, one: SensorFit, ends: Floats, clock: float) -> tup
     return float((np.abs(left) ** 2).sum()), float(np.angle(common.sum())) if pairs else 0.0
 
 
-def _fit(model: AirModel, start: Floats, used: list[Flags], noise: Sequence[float]) -> AirFit:
-    """Return the fit from parameters, to the values of sensors that are used."""
+def _fit(
+    model: AirModel, start: Floats, used: list[Flags], noise: Sequence[float]
+) -> tuple[Floats, Floats, list[Floats]]:
+    """Return parameters, their covariance, and predicted readings of a fit to the values of sensors that are used."""
     jitter = model.simulator.scenario.tracker.jitter_per_axis
 
     def rows(tip: Floats, predicted: Sequence[Floats]) -> Floats:
@@ -365,9 +358,7 @@ def _fit(model: AirModel, start: Floats, used: list[Flags], noise: Sequence[floa
         return np.concatenate([np.stack(columns, axis=1), unit])
 
     found = least_squares(residuals, start, jac=jacobian, method="lm", x_scale=model.sd, xtol=1e-6, ftol=1e-6)
-    tip, predicted = predict(found.x)
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
-    return AirFit(model, found.x, covariance, model.tip - tip, predicted, used, list(noise), [])
+    return found.x, np.linalg.inv(found.jac.T @ found.jac), predict(found.x)[1]
 
 
 def _difference_steps(model: AirModel) -> Floats:
