@@ -130,7 +130,8 @@ def test_a_sensor_without_a_reading_is_drawn():
     lost = [replace(period.sensors[0], readings=(), nis=np.nan) for period in SENSED.periods]
     periods = tuple(replace(one, sensors=(state,)) for one, state in zip(SENSED.periods, lost, strict=True))
     with unarranged():
-        insertion_figure(SCENARIO, replace(SENSED, periods=periods))
+        (panel,) = axes(insertion_figure(SCENARIO, replace(SENSED, periods=periods)), "fbg")
+    assert np.isnan([line.get_ydata() for line in lines(panel, "_measured")]).all()
 
 
 def test_a_site_without_a_value_in_some_readings_has_the_mean_of_the_others():
@@ -153,4 +154,9 @@ def test_readings_without_rows_are_drawn():
     empty = replace(first.sensors[0].readings[0], reading=Reading(0.1, ()))
     one = replace(first, sensors=(replace(first.sensors[0], readings=(empty,)),))
     with unarranged():
-        insertion_figure(SCENARIO, replace(SENSED, periods=(one, *SENSED.periods[1:])))
+        (panel,) = axes(
+            insertion_figure(SCENARIO, replace(SENSED, periods=(one, *SENSED.periods[1:]))), "fbg"
+        )
+    measured = lines(panel, "_measured")[0].get_ydata()
+    assert np.isnan(measured[0])
+    assert not np.isnan(measured[1])
