@@ -10,9 +10,9 @@ from matplotlib.patches import Ellipse
 
 from flexneedle.figures.curves import estimated_path, lateral_error
 from flexneedle.figures.layout import look, short
-from flexneedle.figures.panels import Band, DepthPanel, Level, Line, Mark
+from flexneedle.figures.panels import Band, DepthPanel, Line, Mark
 from flexneedle.figures.scene import View, sections
-from flexneedle.figures.style import ESTIMATE, QUIET, is_column, tone
+from flexneedle.figures.style import ESTIMATE, is_column, tone
 from flexneedle.results import Insertion, Period
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.fbg import Fbg
@@ -151,9 +151,8 @@ def _innovations(insertion: Insertion) -> DepthPanel:
         lines.append(Line("_used", depth[used], nis[used], color, "o"))
         lines.append(Line("_excluded", depth[~used], nis[~used], color, "x"))
         marks += [Mark(at, text, color) for at, text in state_changes(insertion, name)]
-    levels = [Level(1.0, "_expected", QUIET, "-")]
     title = f"Square of innovations (1 on average): ● used, × excluded, mean of {_WINDOW}"
-    return DepthPanel(title, lines, _LEAST_NIS, levels=levels, marks=marks, log=True)
+    return DepthPanel(title, lines, _LEAST_NIS, marks=marks, log=True)
 
 
 def _innovations_of(insertion: Insertion, name: str) -> Floats:

@@ -34,13 +34,8 @@ OFFSET_SDS = 10.0
 """Prior standard deviation of offsets, over the scenario's and over the noise."""
 _LAG_SD = 0.1  # of the tracker's time stamps (s)
 _BIAS_MM = 1.0  # of the tracker
-_STEPS = {
-    "base": 0.05,
-    "slope": 3e-4,
-    "bend": 0.05,
-    "clearance": 0.01,
-    "axial": 0.1,
-}  # for differences, mm and rad
+_STEPS = {"base": 0.05, "slope": 3e-4, "bend": 0.05, "clearance": 0.01, "axial": 0.1}
+"""Steps of differences, mm and rad."""
 _FARTHEST_S, _GRID_S = 0.4, 0.005  # clock errors at which a fit may begin
 _OUTLIER = 5.0  # standard deviations
 _MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
@@ -81,15 +76,11 @@ class AirModel:
         guided, tracked = scenario.setup.has_guide, bool(run.measurements)
         known = scenario.setup.guide_clearance_mm
         clearance = (priors.clearance_mm if known is None else known) if guided else 0.0
+        start = control.start_offset_sd_mm, control.start_angle_sd
         sds = [
-            *np.repeat(
-                [control.start_offset_sd_mm, control.start_angle_sd, priors.bend_sd_mm, priors.run_out_sd_mm],
-                axes,
-            ),
-            priors.clearance_sd_mm * guided,
-            control.start_axial_sd_mm,
-            *[_BIAS_MM] * (1 + axes),
-            _LAG_SD * tracked,
+            *np.repeat([*start, priors.bend_sd_mm, priors.run_out_sd_mm], axes),
+            *(priors.clearance_sd_mm * guided, control.start_axial_sd_mm),
+            *(*[_BIAS_MM] * (1 + axes), _LAG_SD * tracked),
         ]
         sensors = []
         for sensor in (one for one in scenario.sensor if one.title in names):
@@ -103,17 +94,8 @@ class AirModel:
         tips = tips[~rolling(line, tips[:, 0])]
         mean = np.zeros(len(sds))
         mean[slots.clearance] = clearance
-        model = AirModel(
-            simulator,
-            run,
-            line,
-            slots,
-            tuple(sensors),
-            mean,
-            np.maximum(sds, LEAST_SD),
-            tips[:, 0],
-            tips[:, 1 : 2 + axes],
-        )
+        sd, tip = np.maximum(sds, LEAST_SD), tips[:, 1 : 2 + axes]
+        model = AirModel(simulator, run, line, slots, tuple(sensors), mean, sd, tips[:, 0], tip)
         shapes = model.simulate([mean])[1][0]
         return replace(model, sensors=tuple(model._with_readings(one, shapes) for one in sensors))
 
@@ -124,10 +106,8 @@ class AirModel:
         index, *_ = self.line.at(time)
         spacing = self.length / (shapes.shape[1] - 1)
         needles = (Needles(shapes[k + 1][None], spacing) for k in index)
-        values = [
-            read_values(one.sensor, each, needle, one.axes)
-            for each, needle in zip(given, needles, strict=True)
-        ]
+        pairs = zip(given, needles, strict=True)
+        values = [read_values(one.sensor, each, needle, one.axes) for each, needle in pairs]
         value = np.array(values).reshape(-1, one.value.shape[1])
         if one.sensor.rolls and one.axes == 1:  # between half turns it leaves the plane
             value[rolling(self.line, time)] = np.nan
@@ -144,13 +124,10 @@ class AirModel:
         pose = start.base
         states, models = [], []
         for each in parameters:
-            states.append(
-                start.with_estimate(
-                    base_x=float(pose[X] + each[slots.axial]),
-                    base=(pose[Y : Z + 1] + components(each[slots.base])).tolist(),
-                    slope=(pose[3:] + components(each[slots.slope])).tolist(),
-                )
-            )
+            base = (pose[Y : Z + 1] + components(each[slots.base])).tolist()
+            slope = (pose[3:] + components(each[slots.slope])).tolist()
+            base_x = float(pose[X] + each[slots.axial])
+            states.append(start.with_estimate(base_x=base_x, base=base, slope=slope))
             clearance = float(each[slots.clearance]) if self.simulator.scenario.setup.has_guide else None
             models.append(adapt_needle(model, 1.0, from_components(each[slots.bend]), clearance))
         rows = np.array([STILL, *(done.motion.control for done in self.run.moves)])
@@ -228,11 +205,8 @@ class AirFit:
         """Return the offsets (d,) of a sensor, and their standard deviations, with the error of the model."""
         one = self.model.sensors[number]
         unexplained = one.sensor.model_error(self.predicted[number]).mean(axis=0)
-        places = range(one.slots.offset.start, one.slots.offset.stop)
-        return [
-            (value, math.hypot(sd, more))
-            for (value, sd), more in zip(map(self.mean, places), unexplained, strict=True)
-        ]
+        means = map(self.mean, range(one.slots.offset.start, one.slots.offset.stop))
+        return [(value, math.hypot(sd, more)) for (value, sd), more in zip(means, unexplained, strict=True)]
 
     def predict_without_errors(self) -> list[Floats]:
         """Return the predicted readings (r, d) of error-free sensors on the fitted needle."""
@@ -312,10 +286,8 @@ def _regress(model: AirModel, one: SensorFit, ends: Floats, clock: float) -> tup
         predicted, value = (each[:, ::2] + 1j * each[:, 1::2] for each in (predicted, value))
     known = np.isfinite(value)
     count = np.maximum(known.sum(axis=0), 1)
-    x, y = (
-        np.where(known, each - np.where(known, each, 0.0).sum(axis=0) / count, 0.0)
-        for each in (predicted, value)
-    )
+    means = (np.where(known, each, 0.0).sum(axis=0) / count for each in (predicted, value))
+    x, y = (np.where(known, each - mean, 0.0) for each, mean in zip((predicted, value), means, strict=True))
     power, common = (np.abs(x) ** 2).sum(axis=0), (x.conj() * y).sum(axis=0)
     gain = common / (power + (one.sensor.noise / GAIN_SD) ** 2)
     left = y - gain * x
