@@ -121,13 +121,10 @@ def test_registered_kinds_exist():
 
 def test_sensors_of_rig_and_scenario_must_be_the_same():
     assert fit_problems(rig(sensor=[table()]), scenario(FBG)) == []
-    assert fit_problems(rig(sensor=[table(), table("side")]), scenario(FBG, BACK)) == [
-        'sensor[1].name = "side": must be a sensor of the scenario, one of fbg, back',
-        'sensor: the rig has no device for back: add [[sensor]] with name = "back" to its file',
-    ]
-    assert fit_problems(rig(sensor=[table()]), scenario()) == [
-        'sensor[0].name = "fbg": the scenario has no sensor'
-    ]
+    side, back = fit_problems(rig(sensor=[table(), table("side")]), scenario(FBG, BACK))
+    assert side.startswith('sensor[1].name = "side": ')
+    assert 'name = "back"' in back
+    assert len(fit_problems(rig(sensor=[table()]), scenario())) == 1
 
 
 def test_two_sensors_of_one_name_are_refused():
