@@ -24,7 +24,7 @@ class SensorRecord(NamedTuple):
 
 
 def has_sensors(period: Period) -> bool:
-    """Return whether a period has sensors along the needle, or a covariance of the tip."""
+    """Return True if a period has sensors along the needle, or a covariance of the tip."""
     return bool(period.sensors) or period.tip_covariance is not None
 
 

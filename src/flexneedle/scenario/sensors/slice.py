@@ -76,7 +76,7 @@ class Slice(KeyedSensor):
         return cross(along, across[..., :axes], np.zeros(1))[:, 0]
 
     def sees(self, needles: Needles, axes: int) -> "Flags":
-        """Return whether needles have passed the plane (m, axes)."""
+        """Return flags (m, axes): True for needles that have passed the plane."""
         return passed(self._in_frame(needles.points)[0], np.zeros(1), axes)
 
     def model_error(self, values: "Floats") -> "Floats":
