@@ -31,6 +31,9 @@ REFUSED = [
     ({"sensor": [VIEW | {"projection": SIDE}]}, "sensor[0].projection = [-1.0, 0.0, 0.0, 10.0]"),
     ({"sensor": [VIEW | {"projection": ALONG}]}, "sensor[0].projection = [0.0, 0.0, 0.0, 5.0]"),
     ({"sensor": [{"kind": "ct"}]}, 'sensor[0].kind = "ct"'),
+    ({"sensor": [{"sites_mm": [10.0]}]}, "sensor[0].kind"),
+    ({"sensor": [{"kind": "fbg", "sites_mm": [20.0, 10.0]}]}, "sensor[0].sites_mm = [20.0, 10.0]"),
+    ({"sensor": [SLICE | {"noise_per_m": 1.0}]}, "sensor[0].noise_per_m = 1.0"),
 ]
 
 

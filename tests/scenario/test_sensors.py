@@ -129,24 +129,5 @@ def test_pairs_turn_as_complex_numbers_and_in_the_plane_by_the_cosine():
     np.testing.assert_allclose(turn(values, np.array([-1.0 + 0j]), 1), -values)
 
 
-@pytest.mark.parametrize(
-    ("sensor", "problem"),
-    [
-        ({"kind": "sonar"}, "sensor[0].kind"),
-        ({"sites_mm": [10.0]}, "sensor[0].kind"),
-        ({"kind": "fbg", "sites_mm": [20.0, 10.0]}, "sensor[0].sites_mm"),
-        ({"kind": "points", "from_mm": 10.0, "to_mm": 5.0}, "sensor[0].to_mm"),
-        (
-            {"kind": "view", "to_mm": 50.0, "projection": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0]]},
-            "projection",
-        ),
-        ({"kind": "slice", "plane_mm": 30.0, "noise_per_m": 1.0}, "sensor[0].noise_per_m"),
-    ],
-)
-def test_a_wrong_sensor_is_refused_with_its_key(sensor, problem):
-    with pytest.raises(flexneedle.ScenarioError, match=problem.replace("[", r"\[").replace("]", r"\]")):
-        flexneedle.load_scenario("phantom").with_values({"sensor": [sensor]})
-
-
 def test_a_scenario_without_sensors_does_not_list_them():
     assert "sensor" not in flexneedle.load_scenario("phantom").values()
