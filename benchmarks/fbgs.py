@@ -4,8 +4,7 @@
 
 The device is another process; the four sensors are in this one. Prints for 100 frames a second, each of 15.8 kB like a
 captured one: frames and lost frames of each sensor, the time from the device's stamp to the reading, the duration of
-`read()`, the processor time of a sensor; and the duration of a fixed computation in this process without and beside the
-four sensors: what they cost a control period. With --insertions, as many pairs of insertions by the tracker on an
+`read()`, and the processor time of a sensor. With --insertions, as many pairs of insertions by the tracker on an
 emulated rig, without sensors and beside four that read the stream of its needle; of each period with a decision, the
 time to decide and to observe, and late periods. To judge the machine: processor time taken by the host (Linux in a
 virtual machine). Exit status 1 if a frame was lost or the 99 % quantile of the time is above 5 ms. With --quick, one
@@ -74,8 +73,7 @@ def main() -> int:
 
 
 def measure(seconds: float) -> dict[str, Any]:
-    """Return the figures of `seconds` with idle sensors, and of the computation without and beside them."""
-    alone = measure_computation(seconds / 4)
+    """Return the figures of `seconds`."""
     with running(sys.executable, "-m", "flexneedle", "emulate", "fbgs") as (_, address), ExitStack() as stack:
         host, _, port = address.rpartition(":")
         settings = FbgsSettings(host=host, port=int(port), positions_mm=POSITIONS_MM, first=3)
@@ -90,15 +88,9 @@ def measure(seconds: float) -> dict[str, Any]:
                 reads.append(time.perf_counter() - at)
         share = (time.process_time() - used) / seconds / SENSORS
         delays = [delay for one in sensors for delay in one.delays]
-        beside = measure_computation(seconds / 4)
-        return (
-            {"frames": [len(one.lines) for one in sensors], "frames lost": sum(one.lost for one in sensors)}
-            | quantiles("after stamp", delays)
-            | quantiles("read()", reads)
-            | {"processor of a sensor, %": round(100.0 * share, 2)}
-            | quantiles("computation alone", alone)
-            | quantiles("computation beside the sensors", beside)
-        )
+    found = {"frames": [len(one.lines) for one in sensors], "frames lost": sum(one.lost for one in sensors)}
+    found |= quantiles("after stamp", delays) | quantiles("read()", reads)
+    return found | {"processor of a sensor, %": round(100.0 * share, 2)}
 
 
 def measure_insertions(pairs: int) -> dict[str, Any]:
@@ -109,14 +101,12 @@ def measure_insertions(pairs: int) -> dict[str, Any]:
     plan, found = flexneedle.plan(plain, seed=0), dict[int, list[Period]]({0: [], SENSORS: []})
     for seed, sensors in product(range(pairs), found):
         found[sensors] += insert(plain, plan, seed, sensors)
-    return {
-        key: value
-        for sensors, periods in found.items()
-        for key, value in (
-            quantiles(f"period beside {sensors} sensors", [one.durations["total"] for one in periods])
-            | {f"periods beside {sensors} sensors, late": [len(periods), sum(one.late for one in periods)]}
-        ).items()
-    }
+    figures: dict[str, Any] = {}
+    for sensors, periods in found.items():
+        name = f"beside {sensors} sensors"
+        figures |= quantiles(f"period {name}", [one.durations["total"] for one in periods])
+        figures[f"periods {name}, late"] = [len(periods), sum(one.late for one in periods)]
+    return figures
 
 
 def insert(plain: Scenario, plan: Plan, seed: int, sensors: int) -> list[Period]:
@@ -126,40 +116,15 @@ def insert(plain: Scenario, plan: Plan, seed: int, sensors: int) -> list[Period]
         scenario, path = folder / "scenario.toml", folder / "saved.toml"
         fibre = {"kind": "fbg", "sites_mm": list(SITES_MM)}
         scenario.write_text(dump_scenario(plain.with_values({"sensor": [fibre]})), encoding="utf-8")
-        command = (
-            sys.executable,
-            "-m",
-            "flexneedle",
-            "emulate",
-            "rig",
-            rig_in(folder),
-            scenario,
-            "--save",
-            path,
-        )
-        stack.enter_context(running(*command))
+        emulate = *(sys.executable, "-m", "flexneedle", "emulate", "rig"), rig_in(folder), scenario
+        stack.enter_context(running(*emulate, "--save", path))
         rig, clock, wanted = load_rig(path), WallClock(), Fbg.model_validate(fibre)
         settings = rig.sensor[0].settings
         others = [stack.enter_context(closing(make_sensor(settings, clock, wanted))) for _ in range(sensors)]
-        done = flexneedle.insert(
-            plain,
-            plan,
-            seed,
-            rig=SupervisedRig(rig.model_copy(update={"sensor": ()})),
-            listeners=[lambda _event: [one.read() for one in others] and None],
-        )
+        source = SupervisedRig(rig.model_copy(update={"sensor": ()}))
+        listeners = [lambda _event: [one.read() for one in others] and None]
+        done = flexneedle.insert(plain, plan, seed, rig=source, listeners=listeners)
     return [one for one in done.periods if np.isfinite(one.miss[0])]
-
-
-def measure_computation(seconds: float) -> list[float]:
-    """Return the durations (s) of a computation of about 20 ms in Python and NumPy, as between two moves."""
-    taken, begun, matrix = list[float](), time.monotonic(), np.eye(64)
-    while time.monotonic() - begun < seconds:
-        at = time.perf_counter()
-        for _ in range(600):
-            matrix = np.tanh(matrix @ matrix.T)
-        taken.append(time.perf_counter() - at)
-    return taken
 
 
 if __name__ == "__main__":

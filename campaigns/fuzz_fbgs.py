@@ -50,10 +50,8 @@ def frame(payload: bytes, extra: int = 0) -> bytes:
 
 def floats(values: list[float], count: int | None = None) -> bytes:
     with np.errstate(over="ignore"):
-        return (
-            struct.pack("<I", len(values) if count is None else count)
-            + np.array(values).astype("<f4").tobytes()
-        )
+        content = np.array(values).astype("<f4").tobytes()
+    return struct.pack("<I", len(values) if count is None else count) + content
 
 
 def plain(line: int, kappa: float = 0.0025) -> bytes:
@@ -69,17 +67,11 @@ def numbers(random: Random, count: int) -> list[float]:
 
 def fields(random: Random) -> list[tuple[int, bytes]]:
     count = random.choice((0, 1, VALUES - 1, VALUES, VALUES, VALUES, 20))
-    head = [
-        (0, struct.pack("<H", random.choice((0, 0, 0, 7)))),
-        (1, struct.pack("<Q", random.getrandbits(64))),
-    ]
-    stamp = [(2, struct.pack("<d", random.choice(ODD)))]
-    shape = [
-        (5, struct.pack("<II", 3, 2) + bytes(24)),
-        (6, floats([20.0] * count)),
-        (7, random.randbytes(40)),
-    ]
-    return [*head, *stamp, (3, floats(numbers(random, count))), (4, floats(numbers(random, count))), *shape]
+    error, line, stamp = random.choice((0, 0, 0, 7)), random.getrandbits(64), random.choice(ODD)
+    head = struct.pack("<H", error), struct.pack("<Q", line), struct.pack("<d", stamp)
+    arrays = (floats(numbers(random, count)) for _ in range(2))
+    rest = struct.pack("<II", 3, 2) + bytes(24), floats([20.0] * count), random.randbytes(40)
+    return list(enumerate((*head, *arrays, *rest)))
 
 
 def valid(random: Random) -> bytes:

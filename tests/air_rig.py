@@ -9,10 +9,7 @@ from flexneedle.types import Measurement, Motion, Reading
 
 SITES = (70.0, 105.0, 140.0)
 SCENARIO = load_scenario("phantom3d").with_values(
-    {
-        "setup.guide_clearance_mm": 0.0,
-        "sensor": [{"kind": "fbg", "sites_mm": list(SITES)}],
-    }
+    {"setup.guide_clearance_mm": 0.0, "sensor": [{"kind": "fbg", "sites_mm": list(SITES)}]}
 )
 _LENGTH, _SPAN, _START = 150.0, 137.5, -28.5
 
@@ -28,11 +25,8 @@ class BeamRig:
     def __init__(self, gain=0.0, turn=0.0, offset=0.0, late=0.0, ahead=0.0, blind=False):
         self.gain, self.turn, self.offset, self.late = gain, turn, offset, late
         self.ahead, self.blind, self.time, self.stopped, self.held = ahead, blind, 0.0, 0, ""
-        self.ways, self.taken, self.rng = (
-            [(0.0, 0.0, 0.0, 0.0, 0.0)],
-            {"tip": 0, "fbg": 0},
-            np.random.default_rng(5),
-        )
+        self.ways, self.taken = [(0.0, 0.0, 0.0, 0.0, 0.0)], {"tip": 0, "fbg": 0}
+        self.rng = np.random.default_rng(5)
 
     @property
     def ports(self):

@@ -46,11 +46,12 @@ def emulated(*arguments, end=signal.SIGINT):
 
 
 def until(condition, seconds=DEADLINE_S):
-    """Wait until the condition holds; fail at the deadline."""
+    """Wait until the condition holds, and return its value; fail at the deadline."""
     deadline = monotonic() + seconds
-    while not condition():
+    while not (found := condition()):
         assert monotonic() < deadline, "the condition did not hold in time"
         Event().wait(0.002)
+    return found
 
 
 def read_until(tracker, condition, seconds=DEADLINE_S):

@@ -26,6 +26,12 @@ def drawn():
     return insertion_figure(SCENARIO, SENSED)
 
 
+def fbg_panel(*periods):
+    """Return the panel of curvatures of an insertion with these periods."""
+    with unarranged():
+        return axes(insertion_figure(SCENARIO, replace(SENSED, periods=periods)), "fbg")[0]
+
+
 def test_without_sensors_there_is_nothing_of_them():
     with unarranged():
         figure = insertion_figure(flexneedle.load_scenario("phantom"), make_insertion())
@@ -61,9 +67,8 @@ def test_in_space_the_fibre_turns_with_the_needle():
     periods = tuple(
         replace(one, roll=0.7, sensors=(replace(one.sensors[0], readings=bent),)) for one in SENSED.periods
     )
-    space = flexneedle.load_scenario("phantom3d").with_values(
-        {"sensor": [{"kind": "fbg", "sites_mm": [11, 26]}]}
-    )
+    fibre = {"kind": "fbg", "sites_mm": [11, 26]}
+    space = flexneedle.load_scenario("phantom3d").with_values({"sensor": [fibre]})
     with unarranged():
         panels = axes(insertion_figure(space, replace(SENSED, periods=periods)), "fbg y", "fbg z")
     for panel, expected in zip(panels, (2.0, 0.0), strict=True):
@@ -75,9 +80,7 @@ def test_predicted_curvatures_are_those_of_the_estimated_needle():
     angles = np.linspace(-0.3, 0.0, 61)
     arc = np.zeros((61, 5))
     arc[:, 0], arc[:, 1], arc[:, 3] = 500 * np.sin(angles), 500 * (1 - np.cos(angles)), np.tan(angles)
-    bent = replace(SENSED, periods=tuple(replace(period, shape=arc) for period in SENSED.periods))
-    with unarranged():
-        (panel,) = axes(insertion_figure(SCENARIO, bent), "fbg")
+    panel = fbg_panel(*(replace(period, shape=arc) for period in SENSED.periods))
     for site in ("11 mm", "26 mm"):
         np.testing.assert_allclose(lines(panel, site)[0].get_ydata(), 2.0, rtol=1e-3)
 
@@ -129,8 +132,8 @@ def test_a_sensor_without_a_reading_is_drawn():
     """As one that is lost from the start."""
     lost = [replace(period.sensors[0], readings=(), nis=np.nan) for period in SENSED.periods]
     periods = tuple(replace(one, sensors=(state,)) for one, state in zip(SENSED.periods, lost, strict=True))
-    with unarranged():
-        insertion_figure(SCENARIO, replace(SENSED, periods=periods))
+    panel = fbg_panel(*periods)
+    assert np.isnan([line.get_ydata() for line in lines(panel, "_measured")]).all()
 
 
 def test_a_site_without_a_value_in_some_readings_has_the_mean_of_the_others():
@@ -139,10 +142,7 @@ def test_a_site_without_a_value_in_some_readings_has_the_mean_of_the_others():
         CheckedReading(Reading(0.1, ((value, 0.0), (np.nan, np.nan))), OK) for value in (1e-3, np.nan, 3e-3)
     )
     one = replace(first, sensors=(replace(first.sensors[0], readings=readings),))
-    with unarranged():
-        (panel,) = axes(
-            insertion_figure(SCENARIO, replace(SENSED, periods=(one, *SENSED.periods[1:]))), "fbg"
-        )
+    panel = fbg_panel(one, *SENSED.periods[1:])
     near, far = lines(panel, "_measured")
     assert abs(near.get_ydata()[0]) == pytest.approx(2.0)
     assert np.isnan(far.get_ydata()[0])
@@ -152,5 +152,7 @@ def test_readings_without_rows_are_drawn():
     first = SENSED.periods[0]
     empty = replace(first.sensors[0].readings[0], reading=Reading(0.1, ()))
     one = replace(first, sensors=(replace(first.sensors[0], readings=(empty,)),))
-    with unarranged():
-        insertion_figure(SCENARIO, replace(SENSED, periods=(one, *SENSED.periods[1:])))
+    panel = fbg_panel(one, *SENSED.periods[1:])
+    measured = lines(panel, "_measured")[0].get_ydata()
+    assert np.isnan(measured[0])
+    assert not np.isnan(measured[1])

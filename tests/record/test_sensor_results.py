@@ -21,12 +21,11 @@ GOOD = CheckedReading(Reading(0.0, ((1.0,),)), OK)
 
 def fibre_with(*readings, verdicts=None):
     """Return the result of the fibre with these readings in each period."""
-    periods = [replace(one, sensors=(replace(one.sensors[0], readings=readings),)) for one in SENSED.periods]
-    if verdicts is not None:
-        periods = [
-            replace(one, sensors=(replace(one.sensors[0], verdict=verdict),))
-            for one, verdict in zip(periods, verdicts, strict=False)
-        ]
+    periods = []
+    for one, verdict in zip(
+        SENSED.periods, verdicts or [one.sensors[0].verdict for one in SENSED.periods], strict=False
+    ):
+        periods.append(replace(one, sensors=(replace(one.sensors[0], readings=readings, verdict=verdict),)))
     return sensor_results(replace(SENSED, periods=tuple(periods)))[0]
 
 

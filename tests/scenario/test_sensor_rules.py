@@ -15,49 +15,33 @@ from flexneedle.types import Needles, Reading
 PHANTOM = load_scenario("phantom")
 SLICE = {"kind": "slice", "plane_mm": 30.0}
 POINTS = {"kind": "points", "to_mm": 40.0}
-REFUSED = {
-    "nothing measures": (
-        {"tracker.enabled": False},
-        "tracker.enabled = false: nothing measures the needle: ",
-    ),
-    "sites": (
-        {"sensor": [{"kind": "fbg", "sites_mm": [10.0, 149.0]}]},
-        "sensor[0].sites_mm = 149.0: the last gauge must end at most 150 from the tip",
-    ),
-    "plane too deep": (
-        {"sensor": [SLICE | {"plane_mm": 81.5}]},
-        "sensor[0].plane_mm = 81.5: is never crossed: ",
-    ),
-    "plane behind": (
-        {"sensor": [SLICE | {"plane_mm": -180.0}]},
-        "sensor[0].plane_mm = -180.0: is never crossed: ",
-    ),
-    "range": (
-        {"sensor": [POINTS | {"from_mm": 90.0, "to_mm": 99.0}]},
-        "sensor[0].from_mm = 90.0: no needle is there: the tip goes to 81.5",
-    ),
-    "range falls": (
-        {"sensor": [POINTS | {"to_mm": -1.0}]},
-        "sensor[0].to_mm = -1.0: must be above from_mm (0)",
-    ),
-    "twice": ({"sensor": [SLICE, SLICE]}, 'sensor[1].name = "slice": must differ from the name of sensor[0]'),
-    "tracker": (
-        {"sensor": [SLICE | {"name": "tracker"}]},
-        'sensor[0].name = "tracker": must differ from the name of the tracker',
-    ),
-    "rate": ({"sensor": [SLICE | {"rate_hz": 1e5}]}, "sensor[0].rate_hz = 100000.0: must be at most 50000"),
-    "kind": (
-        {"sensor": [{"kind": "ct"}]},
-        'sensor[0].kind = "ct": must be one of fbg, points, slice, view, or',
-    ),
-}
+VIEW = {"kind": "view", "to_mm": 40.0}
+SIDE = [[8.0, 0.0, 0.0, 0.0], [0.0, 8.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 10.0]]  # the axis passes the camera
+ALONG = [[0.0, 0.0, 0.0, 5.0], [0.0, 8.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]  # the axis is a point
+REFUSED = [
+    ({"tracker.enabled": False}, "tracker.enabled = false"),
+    ({"sensor": [{"kind": "fbg", "sites_mm": [10.0, 149.0]}]}, "sensor[0].sites_mm = 149.0"),
+    ({"sensor": [SLICE | {"plane_mm": 81.5}]}, "sensor[0].plane_mm = 81.5"),
+    ({"sensor": [SLICE | {"plane_mm": -180.0}]}, "sensor[0].plane_mm = -180.0"),
+    ({"sensor": [POINTS | {"from_mm": 90.0, "to_mm": 99.0}]}, "sensor[0].from_mm = 90.0"),
+    ({"sensor": [POINTS | {"to_mm": -1.0}]}, "sensor[0].to_mm = -1.0"),
+    ({"sensor": [SLICE, SLICE]}, 'sensor[1].name = "slice"'),
+    ({"sensor": [SLICE | {"name": "tracker"}]}, 'sensor[0].name = "tracker"'),
+    ({"sensor": [SLICE | {"rate_hz": 1e5}]}, "sensor[0].rate_hz = 100000.0"),
+    ({"sensor": [VIEW | {"projection": SIDE}]}, "sensor[0].projection = [-1.0, 0.0, 0.0, 10.0]"),
+    ({"sensor": [VIEW | {"projection": ALONG}]}, "sensor[0].projection = [0.0, 0.0, 0.0, 5.0]"),
+    ({"sensor": [{"kind": "ct"}]}, 'sensor[0].kind = "ct"'),
+    ({"sensor": [{"sites_mm": [10.0]}]}, "sensor[0].kind"),
+    ({"sensor": [{"kind": "fbg", "sites_mm": [20.0, 10.0]}]}, "sensor[0].sites_mm = [20.0, 10.0]"),
+    ({"sensor": [SLICE | {"noise_per_m": 1.0}]}, "sensor[0].noise_per_m = 1.0"),
+]
 
 
-@pytest.mark.parametrize(("changes", "line"), REFUSED.values(), ids=REFUSED)
-def test_sensors_that_cannot_measure_are_refused_in_one_line(changes, line):
+@pytest.mark.parametrize(("changes", "key"), REFUSED)
+def test_sensors_that_cannot_measure_are_refused_in_one_line(changes, key):
     with pytest.raises(ScenarioError) as caught:
         PHANTOM.with_values(changes)
-    assert str(caught.value).startswith(line)
+    assert str(caught.value).startswith(f"{key}: ")
     assert "\n" not in str(caught.value)
 
 
@@ -101,33 +85,25 @@ def raising(*_):
     raise ZeroDivisionError("no needle")
 
 
-WRONG = {
-    "no parts": ({"base": Sensor}, "must define noise, predict"),
-    "no sensor": ({"base": object}, "must be a subclass of flexneedle.Sensor"),
-    "shape": (
-        {"predict": lambda _, n, __: n.at(0.0)[:, Y]},
-        "predict must return an array of the shape (3, 1), ",
-    ),
-    "not finite": (
-        {"predict": lambda _, n, __: np.full((len(n.poses), 1), np.nan)},
-        "predict must return finite numbers for every needle",
-    ),
-    "raises": ({"predict": raising}, "raises ZeroDivisionError: no needle"),
-    "no noise": ({"noise": property(lambda _: 0.0)}, "noise must be above 0, not 0.0"),
-    "size": ({"size": lambda *_: 0}, "size must return a whole number above 0"),
-    "rolls alone": ({"rolls": True}, "a sensor that rolls must be paired"),
-    "model error": (
-        {"model_error": lambda *_: np.array([-1.0])},
-        "model_error must return an array of the shape ",
-    ),
-}
+WRONG = [
+    ({"base": Sensor}, "noise, predict"),
+    ({"base": object}, "flexneedle.Sensor"),
+    ({"predict": lambda _, n, __: n.at(0.0)[:, Y]}, "predict must return an array"),
+    ({"predict": lambda _, n, __: np.full((len(n.poses), 1), np.nan)}, "finite"),
+    ({"predict": raising}, "ZeroDivisionError: no needle"),
+    ({"noise": property(lambda _: 0.0)}, "noise must"),
+    ({"size": lambda *_: 0}, "size must"),
+    ({"rolls": True}, "paired"),
+    ({"model_error": lambda *_: np.array([-1.0])}, "model_error must"),
+]
 
 
-@pytest.mark.parametrize(("parts", "rule"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("parts", "rule"), WRONG)
 def test_a_wrong_kind_is_refused_in_one_line(monkeypatch, parts, rule):
     with pytest.raises(ScenarioError) as caught:
         own(monkeypatch, **parts)
-    assert str(caught.value).startswith(f'sensor[0].kind = "own_sensors:Kind": {rule}')
+    assert str(caught.value).startswith('sensor[0].kind = "own_sensors:Kind": ')
+    assert rule in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -137,16 +113,12 @@ def test_a_kind_of_two_definitions_has_its_name(monkeypatch):
 
 
 def test_values_that_break_a_rule_during_an_insertion_name_the_sensor(monkeypatch):
-    (sensor,) = own(
-        monkeypatch, predict=lambda _, n, __: np.where(n.poses[:, :1, 0] < 0.0, 1.0, np.inf)
-    ).sensor
-    poses = np.zeros((1, 3, 5))
-    with pytest.raises(DriverError, match="sensor Kind: predict must return finite"):
-        predict_values(sensor, Needles(poses, 1.0), 1)
-    with pytest.raises(
-        DriverError, match="sensor Kind: a reading has 2 rows of 1 numbers, expected 1 numbers"
-    ):
-        read_values(sensor, Reading(0.0, ((1.0,), (2.0,))), Needles(poses, 1.0), 1)
+    part = {"predict": lambda _, n, __: np.where(n.poses[:, :1, 0] < 0.0, 1.0, np.inf)}
+    (sensor,), needles = own(monkeypatch, **part).sensor, Needles(np.zeros((1, 3, 5)), 1.0)
+    with pytest.raises(DriverError, match=r"sensor Kind: .*finite"):
+        predict_values(sensor, needles, 1)
+    with pytest.raises(DriverError, match=r"sensor Kind: .*2 rows"):
+        read_values(sensor, Reading(0.0, ((1.0,), (2.0,))), needles, 1)
 
 
 def test_poses_at_a_depth_are_on_the_needle_and_straight_beyond_it():

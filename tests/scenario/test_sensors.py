@@ -53,9 +53,8 @@ def test_slopes_between_nodes_converge_with_the_third_power_of_their_distance():
     places = np.linspace(8.0, 140.0, 400)
 
     def error(nodes):
-        return np.abs(
-            tilts_at(wave(nodes), places)[0, :, 0] - np.arctan(0.02 * np.sin((LENGTH - places) / 25.0))
-        ).max()
+        exact = np.arctan(0.02 * np.sin((LENGTH - places) / 25.0))
+        return np.abs(tilts_at(wave(nodes), places)[0, :, 0] - exact).max()
 
     assert error(31) / error(61) == pytest.approx(8.0, rel=0.1)
 
@@ -68,13 +67,7 @@ def test_the_derivatives_to_the_sites_are_those_of_moved_sites():
     assert not sensor.slopes(needle, 2)[:, 2:, 0].any()
 
 
-@given(
-    st.floats(-0.15, 0.15),
-    st.floats(-0.15, 0.15),
-    st.floats(-0.3, 0.3),
-    st.floats(-0.3, 0.3),
-    st.floats(20.0, 120.0),
-)
+@given(*[st.floats(-0.15, 0.15)] * 2, *[st.floats(-0.3, 0.3)] * 2, st.floats(20.0, 120.0))
 def test_a_straight_needle_crosses_a_plane_of_any_pose_at_the_point_of_the_line(up, out, lean, turn_, at):
     sensor = Slice(kind="slice", plane_mm=at, normal=(1.0, lean, turn_))
     needle = straight((0.0, 1.0, -2.0), (up, out))
@@ -92,17 +85,12 @@ def test_points_anywhere_along_the_needle_are_read_at_the_stations():
     x = np.random.default_rng(0).uniform(12.0, 100.0, 40)
     off, cos, sin = 300.0 - np.sqrt(300.0**2 - x**2), np.cos(0.7), np.sin(0.7)
     rows = np.column_stack([x, cos * off + 0.2, sin * off - 0.1])
-    found = (
-        sensor.read(Reading(0.0, tuple(map(tuple, rows.tolist()))), needle, 2) - sensor.predict(needle, 2)[0]
-    )
-    seen = np.isfinite(found)
-    np.testing.assert_allclose(
-        found[seen].reshape(-1, 2), np.tile([0.2, -0.1], (seen.sum() // 2, 1)), atol=2e-3
-    )
-    assert (
-        sensor.sees(needle, 2)[0].tolist()
-        == np.repeat(sensor.stations <= needle.points[0, -1, 0], 2).tolist()
-    )
+    reading = Reading(0.0, tuple(map(tuple, rows.tolist())))
+    off = sensor.read(reading, needle, 2) - sensor.predict(needle, 2)[0]
+    off = off[np.isfinite(off)].reshape(-1, 2)
+    np.testing.assert_allclose(off, np.tile([0.2, -0.1], (len(off), 1)), atol=2e-3)
+    passed = np.repeat(sensor.stations <= needle.points[0, -1, 0], 2)
+    np.testing.assert_array_equal(sensor.sees(needle, 2)[0], passed)
 
 
 def test_a_view_measures_pixels_across_the_image_of_the_axis():
@@ -115,10 +103,9 @@ def test_a_view_measures_pixels_across_the_image_of_the_axis():
     seen = np.isfinite(found)
     np.testing.assert_allclose(found[seen], sensor.predict(needle, 2)[0][seen], atol=0.02)
     assert not sensor.predict(straight((-20.0, 0.0, 0.0), (0.0, 0.0)), 2).round(9).any()
-    reported = sensor.report(sensor.predict(needle, 2)[0], 2)
-    np.testing.assert_allclose(
-        sensor.read(Reading(0.0, reported), needle, 2), sensor.predict(needle, 2)[0], atol=1e-9
-    )
+    values = sensor.predict(needle, 2)[0]
+    back = sensor.read(Reading(0.0, sensor.report(values, 2)), needle, 2)
+    np.testing.assert_allclose(back, values, atol=1e-9)
 
 
 def test_pairs_turn_as_complex_numbers_and_in_the_plane_by_the_cosine():
@@ -127,25 +114,6 @@ def test_pairs_turn_as_complex_numbers_and_in_the_plane_by_the_cosine():
     pairs = (values[:, ::2] + 1j * values[:, 1::2]) * np.exp(0.4j)
     np.testing.assert_allclose(turned[:, ::2] + 1j * turned[:, 1::2], pairs)
     np.testing.assert_allclose(turn(values, np.array([-1.0 + 0j]), 1), -values)
-
-
-@pytest.mark.parametrize(
-    ("sensor", "problem"),
-    [
-        ({"kind": "sonar"}, "sensor[0].kind"),
-        ({"sites_mm": [10.0]}, "sensor[0].kind"),
-        ({"kind": "fbg", "sites_mm": [20.0, 10.0]}, "sensor[0].sites_mm"),
-        ({"kind": "points", "from_mm": 10.0, "to_mm": 5.0}, "sensor[0].to_mm"),
-        (
-            {"kind": "view", "to_mm": 50.0, "projection": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0]]},
-            "projection",
-        ),
-        ({"kind": "slice", "plane_mm": 30.0, "noise_per_m": 1.0}, "sensor[0].noise_per_m"),
-    ],
-)
-def test_a_wrong_sensor_is_refused_with_its_key(sensor, problem):
-    with pytest.raises(flexneedle.ScenarioError, match=problem.replace("[", r"\[").replace("]", r"\]")):
-        flexneedle.load_scenario("phantom").with_values({"sensor": [sensor]})
 
 
 def test_a_scenario_without_sensors_does_not_list_them():

@@ -48,16 +48,6 @@ class Band:
 
 
 @dataclass(frozen=True)
-class Level:
-    """A horizontal line with its name."""
-
-    y: float
-    name: str
-    color: str
-    style: str
-
-
-@dataclass(frozen=True)
 class Mark:
     """An event at a depth, with its text."""
 
@@ -71,7 +61,7 @@ class DepthPanel:
     """Lines over the depth of the tip; the y axis spans at least `least`.
 
     angles: the lines are angles in degrees; peaks: the largest value of each line is marked; log: the y axis is
-    logarithmic and begins at `least` or above.
+    logarithmic, begins at `least` or above, and has a line at 1.
     """
 
     title: str
@@ -80,7 +70,6 @@ class DepthPanel:
     angles: bool = False
     peaks: bool = False
     bands: Sequence[Band] = ()
-    levels: Sequence[Level] = ()
     marks: Sequence[Mark] = ()
     log: bool = False
 
@@ -113,16 +102,10 @@ def _draw_panel(ax: Axes, scenario: Scenario, panel: DepthPanel) -> None:
     ax.axvline(0.0, color="#8c5a36", linewidth=1.0, zorder=1)
     if panel.log:
         ax.set_yscale("log")
-    else:
-        ax.axhline(0.0, color=QUIET, linewidth=0.6, zorder=1)
+    ax.axhline(1.0 if panel.log else 0.0, color=QUIET, linewidth=0.6, zorder=1)
     for band in panel.bands:
-        ax.fill_between(
-            band.x, band.low, band.high, color=band.color, alpha=0.25, linewidth=0.0, label=band.name
-        )
-    for level in panel.levels:
-        ax.axhline(
-            level.y, color=level.color, linestyle=level.style, linewidth=0.8, zorder=2, label=level.name
-        )
+        how: dict[str, Any] = {"color": band.color, "alpha": 0.25, "linewidth": 0.0}
+        ax.fill_between(band.x, band.low, band.high, label=band.name, **how)
     _draw_lines(ax, panel.title, panel.lines)
     for line in panel.lines:
         if len(line.x) and line.style not in _POINTS:
@@ -146,18 +129,13 @@ def _draw_marks(ax: Axes, marks: Sequence[Mark]) -> None:
     for number, mark in enumerate(marks):
         ax.axvline(mark.x, color=mark.color, linewidth=1.0, zorder=2)
         side = -1 if mark.x > middle else 1
-        beside: dict[str, Any] = {
+        how: dict[str, Any] = {
             "xytext": (3 * side, -9 * number - 2),
             "textcoords": "offset points",
-            "va": "top",
+            "zorder": 4,
         }
-        beside |= {
-            "ha": "left" if side > 0 else "right",
-            "color": mark.color,
-            "fontsize": small(),
-            "bbox": BOX,
-        }
-        made = ax.annotate(mark.text, (mark.x, 1.0), xycoords=ax.get_xaxis_transform(), zorder=4, **beside)
+        how |= {"va": "top", "ha": "left" if side > 0 else "right", "color": mark.color, "fontsize": small()}
+        made = ax.annotate(mark.text, (mark.x, 1.0), xycoords=ax.get_xaxis_transform(), bbox=BOX, **how)
         made.set_in_layout(False)  # a long one would make the panels narrow
 
 
@@ -183,12 +161,9 @@ def _draw_lines(ax: Axes, title: str, lines: Sequence[Line]) -> None:
     if drawn and is_narrow():
         _name_above(ax)
     elif drawn:
-        many = (
-            {"labelspacing": 0.2, "borderaxespad": 0.0}
-            if len(ax.get_legend_handles_labels()[1]) > _FEW
-            else {}
-        )
-        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=1.4, **many)
+        many = len(ax.get_legend_handles_labels()[1]) > _FEW
+        dense = {"labelspacing": 0.2, "borderaxespad": 0.0} if many else {}
+        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=1.4, **dense)
 
 
 def _name_above(ax: Axes) -> None:
@@ -220,7 +195,7 @@ def _why_empty(lines: Sequence[Line]) -> str:
 def _set_height(ax: Axes, panel: DepthPanel) -> None:
     if panel.log:
         ax.yaxis.set_major_formatter("{x:g}")
-        values = np.concatenate([[level.y for level in panel.levels], *(line.y for line in panel.lines)])
+        values = np.concatenate([[1.0], *(line.y for line in panel.lines)])
         positive = values[values > 0.0]
         ax.set_ylim(0.7 * max(panel.least, float(positive.min())), 1.6 * float(positive.max()))
         return

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,9 +10,9 @@ from matplotlib.patches import Ellipse
 
 from flexneedle.figures.curves import estimated_path, lateral_error
 from flexneedle.figures.layout import look, short
-from flexneedle.figures.panels import Band, DepthPanel, Level, Line, Mark
+from flexneedle.figures.panels import Band, DepthPanel, Line, Mark
 from flexneedle.figures.scene import View, sections
-from flexneedle.figures.style import ESTIMATE, QUIET, is_column, tone
+from flexneedle.figures.style import ESTIMATE, is_column, tone
 from flexneedle.results import Insertion, Period
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.fbg import Fbg
@@ -29,12 +29,6 @@ _MOST_SITES = 6
 _REASON = 44  # characters
 _LEAST_NIS = 0.02
 _TURNED = 0.3  # rad; readings of a period with a larger turn are at several angles
-
-
-class _Innovations(NamedTuple):
-    depth: Floats
-    nis: Floats
-    used: Floats
 
 
 def sensor_panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
@@ -151,25 +145,25 @@ def _innovations(insertion: Insertion) -> DepthPanel:
     names = list(dict.fromkeys(state.name for period in insertion.periods for state in period.sensors))
     lines, marks = [], []
     for number, name in enumerate(names):
-        color, found = look(number).color, _innovations_of(insertion, name)
-        used = found.used > 0.0
-        lines.append(Line(name, found.depth, _running_mean(found.nis), color))
-        lines.append(Line("_used", found.depth[used], found.nis[used], color, "o"))
-        lines.append(Line("_excluded", found.depth[~used], found.nis[~used], color, "x"))
-        marks += [Mark(depth, text, color) for depth, text in state_changes(insertion, name)]
-    levels = [Level(1.0, "_expected", QUIET, "-")]
+        color, (depth, nis, ok) = look(number).color, _innovations_of(insertion, name)
+        used = ok > 0.0
+        lines.append(Line(name, depth, _running_mean(nis), color))
+        lines.append(Line("_used", depth[used], nis[used], color, "o"))
+        lines.append(Line("_excluded", depth[~used], nis[~used], color, "x"))
+        marks += [Mark(at, text, color) for at, text in state_changes(insertion, name)]
     title = f"Square of innovations (1 on average): ● used, × excluded, mean of {_WINDOW}"
-    return DepthPanel(title, lines, _LEAST_NIS, levels=levels, marks=marks, log=True)
+    return DepthPanel(title, lines, _LEAST_NIS, marks=marks, log=True)
 
 
-def _innovations_of(insertion: Insertion, name: str) -> _Innovations:
+def _innovations_of(insertion: Insertion, name: str) -> Floats:
+    """Return depths of the tip (mm), normalised squares, and 1 where the sensor was used, (3, k)."""
     rows = [
         (period.estimate.x, state.nis, state.verdict.ok)
         for period in insertion.periods
         for state in period.sensors
         if state.name == name and not math.isnan(state.nis)
     ]
-    return _Innovations(*np.array(rows, dtype=float).reshape(-1, 3).T)
+    return np.array(rows, dtype=float).reshape(-1, 3).T
 
 
 def _running_mean(values: Floats) -> Floats:

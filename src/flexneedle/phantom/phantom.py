@@ -162,12 +162,7 @@ class Phantom:
 
     def _keep_shape(self, time: float) -> None:
         if self._keeps_shapes:
-            nodes = getattr(self._plant, "nodes", None)
-            if nodes is None:
-                raise InputError(
-                    f"phantom = {type(self._plant).__name__}: without nodes no [[sensor]] can measure it"
-                )
-            self._shapes.add(time, self._plant.roll, to_poses(nodes))
+            self._shapes.add(time, self._plant.roll, poses_of(self._plant))
 
     def _round_to_steps(self, command: Control) -> Floats:
         """Return the command in whole motor steps, within the limits; the rotation of the base is not rounded."""
@@ -214,6 +209,14 @@ def of_arc(roll: float, part: float) -> complex:
     """Return the share of the chord, as a lateral quantity, at a part of an arc by `roll` (rad)."""
     whole = cmath.exp(1j * roll) - 1.0
     return (cmath.exp(1j * roll * part) - 1.0) / whole if abs(whole) > _WHOLE else complex(part)
+
+
+def poses_of(plant: Plant) -> Floats:
+    """Return the poses (n, 5) of a needle. Raises InputError for a plant without nodes."""
+    nodes = getattr(plant, "nodes", None)
+    if nodes is None:
+        raise InputError(f"phantom = {type(plant).__name__}: without nodes no [[sensor]] can measure it")
+    return to_poses(nodes)
 
 
 def to_poses(nodes: Floats) -> Floats:

@@ -67,34 +67,22 @@ def _points(state: SensorState, plan: Plan) -> list[Point]:
     kinds = [] if scenario is None else [one for one in scenario.sensor if one.title == state.name]
     if scenario is None or not any(isinstance(one, Slice | Points) for one in kinds):
         return []
-    rows = [
-        row
-        for one in state.good
-        for row in one.rows
-        if all(map(math.isfinite, row[: 1 + scenario.setup.axes]))
-    ]
-    return [(x, y, z if math.isfinite(z) else 0.0) for x, y, z in rows]
+    rows = (row for one in state.good for row in one.rows)
+    known = (row for row in rows if all(map(math.isfinite, row[: 1 + scenario.setup.axes])))
+    return [(x, y, z if math.isfinite(z) else 0.0) for x, y, z in known]
 
 
 def _result(insertion: Insertion, name: str) -> SensorResult:
-    steps = [
-        (period, state) for period in insertion.periods for state in period.sensors if state.name == name
-    ]
+    every = ((period, state) for period in insertion.periods for state in period.sensors)
+    steps = [(period, state) for period, state in every if state.name == name]
     verdicts = [one.verdict for _, state in steps for one in state.readings]
     missing = sum(verdict.kind is VerdictKind.MISSING for verdict in verdicts)
     valid = len(verdicts) - missing
     good = sum(verdict.ok for verdict in verdicts)
     used = [state.nis for _, state in steps if state.verdict.ok and not math.isnan(state.nis)]
     last, since = steps[-1][1].verdict, _excluded_mm(steps)
-    return SensorResult(
-        name,
-        len(verdicts),
-        missing,
-        1.0 - good / valid if valid else 0.0,
-        sum(used) / len(used) if used else math.nan,
-        "" if last.ok else str(last),
-        since,
-    )
+    rejected, nis = 1.0 - good / valid if valid else 0.0, sum(used) / len(used) if used else math.nan
+    return SensorResult(name, len(verdicts), missing, rejected, nis, "" if last.ok else str(last), since)
 
 
 def _excluded_mm(steps: list[tuple[Period, SensorState]]) -> float:

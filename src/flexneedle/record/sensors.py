@@ -24,17 +24,15 @@ class SensorRecord(NamedTuple):
 
 
 def has_sensors(period: Period) -> bool:
-    """Return whether a period has sensors along the needle, or a covariance of the tip."""
+    """Return True if a period has sensors along the needle, or a covariance of the tip."""
     return bool(period.sensors) or period.tip_covariance is not None
 
 
 def state_checks(period: Period) -> Iterator[tuple[str, Check]]:
     """Yield name and check of the tip, then of each sensor."""
     covariance = period.tip_covariance
-    yield (
-        TIP,
-        Check("", good=True, values={} if covariance is None else {_COVARIANCE: matrix_text(covariance)}),
-    )
+    known = {} if covariance is None else {_COVARIANCE: matrix_text(covariance)}
+    yield TIP, Check("", good=True, values=known)
     for one in period.sensors:
         yield one.name, Check(str(one.verdict), one.verdict.ok, {"nis": repr(float(one.nis))})
 
@@ -56,16 +54,13 @@ def restore(states: DiagnosticArray, readings: Sequence[DiagnosticStatus]) -> Se
     """Return the fields of the statuses of both topics; raises KeyError, ValueError or InputError for others."""
     tip, *others = states.status
     covariance = _pairs(tip).get(_COVARIANCE)
-    sensors = tuple(
-        SensorState(
-            one.name,
-            tuple(_reading(each) for each in readings if each.name == one.name),
-            parse_verdict(one.message),
-            float(_pairs(one)["nis"]),
-        )
-        for one in others
-    )
+    sensors = tuple(_state(one, readings) for one in others)
     return SensorRecord(sensors, None if covariance is None else parse_matrix(covariance))
+
+
+def _state(status: DiagnosticStatus, readings: Sequence[DiagnosticStatus]) -> SensorState:
+    own = tuple(_reading(each) for each in readings if each.name == status.name)
+    return SensorState(status.name, own, parse_verdict(status.message), float(_pairs(status)["nis"]))
 
 
 def _reading(status: DiagnosticStatus) -> CheckedReading:

@@ -70,14 +70,9 @@ class MeasuringConformance:
         """Require times that increase, none later than now, and the last not before the start."""
         require_increasing(f"times of {self.item}s", [one.time for one in found])
         require_finite(f"times of {self.item}s", [one.time for one in found])
-        last = found[-1].time
-        require(
-            last <= now + 1e-6, f"a {self.item} has the time {last} s, now is {now} s on the clock of the run"
-        )
-        require(
-            start - last < self.seconds,
-            f"the last {self.item} has the time {last} s, before the start at {start} s",
-        )
+        last, where = found[-1].time, f"the last {self.item} has the time {found[-1].time} s"
+        require(last <= now + 1e-6, f"{where}, now is {now} s on the clock of the run")
+        require(start - last < self.seconds, f"{where}, before the start at {start} s")
 
     def test_has_the_parts_of_the_port(self) -> None:
         """Require `read`, `status` as text, and a way to close."""
@@ -88,16 +83,12 @@ class MeasuringConformance:
     def test_arrives_at_its_rate(self) -> None:
         """Require at least `least_hz` in a second, with a status that agrees."""
         with self._open() as (device, clock):
-            found = self._collect(device, clock)
-            least = self.least_hz * self.seconds
+            count, least = len(self._collect(device, clock)), self.least_hz * self.seconds
+            status, wanted = device.status, f"must be {VISIBLE!r} while {self.item}s arrive"
             require(
-                len(found) >= least,
-                f"{len(found)} {self.item}s in {self.seconds} s, at least {least:g} are needed",
+                count >= least, f"{count} {self.item}s in {self.seconds} s, at least {least:g} are needed"
             )
-            require(
-                device.status == VISIBLE,
-                f"status must be {VISIBLE!r} while {self.item}s arrive: {device.status!r}",
-            )
+            require(status == VISIBLE, f"status {wanted}: {status!r}")
 
     def test_read_does_not_wait(self) -> None:
         """Require that a read returns at once, also directly after another."""
@@ -119,7 +110,5 @@ class MeasuringConformance:
                     device.read()
             except RunError:
                 return
-            require(
-                device.status not in ("", VISIBLE),
-                f"status must have the reason while no {self.item}s arrive",
-            )
+            rule = f"status must have the reason while no {self.item}s arrive"
+            require(device.status not in ("", VISIBLE), rule)

@@ -36,10 +36,8 @@ class NeedleSensorConformance(MeasuringConformance):
             found = self._collect(sensor, clock)
             for one in found:
                 known = any(math.isfinite(value) for row in one.rows for value in row)
-                require(
-                    known or one.status not in ("", VISIBLE),
-                    f"a reading without a number needs a reason: {one}",
-                )
+                rule = f"a reading without a number needs a reason: {one}"
+                require(known or one.status not in ("", VISIBLE), rule)
             measured = [one for one in found if one.rows]
             require(2 * len(measured) > len(found), f"most readings have no rows: {found[-1].status}")
             widths = {len(row) for one in measured for row in one.rows}

@@ -104,15 +104,10 @@ class SensorConformance:
             needles = self._some(axes)
             shape = len(needles.poses), sensor.size(axes)
             seen = np.asarray(sensor.sees(needles, axes))
-            require(
-                seen.shape == shape and seen.dtype == bool,
-                f"`sees` must return flags {shape}, not {seen.dtype} {seen.shape}",
-            )
-            slopes, places = np.asarray(sensor.slopes(needles, axes)), len(sensor.place_sds)
-            require(
-                slopes.shape == (*shape, places),
-                f"slopes must return an array {(*shape, places)}, not {slopes.shape}",
-            )
+            rule = f"`sees` must return flags {shape}, not {seen.dtype} {seen.shape}"
+            require(seen.shape == shape and seen.dtype == bool, rule)
+            slopes, wanted = np.asarray(sensor.slopes(needles, axes)), (*shape, len(sensor.place_sds))
+            require(slopes.shape == wanted, f"slopes must return an array {wanted}, not {slopes.shape}")
             require_finite("slopes", slopes)
 
     def test_read_inverts_report(self) -> None:
@@ -140,18 +135,14 @@ class SensorConformance:
             return
         turned = turn(np.asarray(sensor.predict(self._some(2), 2)), np.exp(0.7j), 2)
         same = np.allclose(sensor.predict(self._some(2, 0.7), 2), turned, rtol=1e-3, atol=1e-3 * sensor.noise)
-        require(
-            same, "values of a sensor that rolls must be lateral vectors: they do not turn with the needle"
-        )
+        require(same, "values of a sensor that rolls must turn with the needle, as lateral vectors")
 
     def test_same_seed_same_virtual_sensor(self) -> None:
         """Require equal errors of the virtual sensor for equal randomness."""
         for axes in self.axes:
-            drawn = [self._draw(axes, np.random.default_rng(3)) for _ in range(2)]
-            require(
-                np.array_equal(drawn[0], drawn[1]), "the same randomness must give the same virtual sensor"
-            )
-            require_finite("drawn errors", drawn[0])
+            first, second = (self._draw(axes, np.random.default_rng(3)) for _ in range(2))
+            require(np.array_equal(first, second), "the same randomness must give the same virtual sensor")
+            require_finite("drawn errors", first)
 
     def _draw(self, axes: int, rng: np.random.Generator) -> Floats:
         """Return values of the mounted sensor, offsets and drifts, one after the other."""
@@ -162,25 +153,18 @@ class SensorConformance:
     def test_corrects_an_insertion(self) -> None:
         """Require an insertion in which its readings agree with the model, and the sensor is not excluded."""
         insertion, name = self._insertion(), self.make().title
-        require(
-            insertion.outcome is Outcome.DONE, f"the insertion ended {insertion.outcome}: {insertion.reason}"
-        )
+        ended = f"the insertion ended {insertion.outcome}: {insertion.reason}"
+        require(insertion.outcome is Outcome.DONE, ended)
         states = [state for period in insertion.periods for state in period.sensors if state.name == name]
         require(states, f"no sensor {name} in the record")
         excluded = [str(state.verdict) for state in states if not state.verdict.ok]
         require(not excluded, f"the sensor was excluded: {excluded[-1] if excluded else ''}")
-        verdicts = [
-            one.verdict
-            for state in states
-            for one in state.readings
-            if one.verdict.kind is not VerdictKind.MISSING
-        ]
+        every = [one.verdict for state in states for one in state.readings]
+        verdicts = [verdict for verdict in every if verdict.kind is not VerdictKind.MISSING]
         require(verdicts, "the sensor measured nothing in the insertion: check `sees`, `report` and `read`")
         bad = [str(verdict) for verdict in verdicts if not verdict.ok]
-        require(
-            len(bad) <= _REJECTED * len(verdicts),
-            f"{len(bad)} of {len(verdicts)} readings were rejected: {bad[-1] if bad else ''}",
-        )
+        rejected = f"{len(bad)} of {len(verdicts)} readings were rejected: {bad[-1] if bad else ''}"
+        require(len(bad) <= _REJECTED * len(verdicts), rejected)
 
     def _insertion(self) -> Insertion:
         scenario = self._scenario.with_values({"sensor": [self.make()]})

@@ -142,11 +142,7 @@ def test_after_another_registration_points_are_refused_until_the_scenarios_comes
         (POINTS, {}, "device: missing"),
         (POINTS, {"device": DEVICE, "axis": "x"}, 'axis = "x": unknown key'),
         (POINTS, {"device": DEVICE, "late_ms": -1.0}, "late_ms = -1.0"),
-        (
-            Fbg(kind="fbg", sites_mm=(10.0,)),
-            {"device": DEVICE},
-            'fbg of the scenario has kind = "fbg": must be',
-        ),
+        (Fbg(kind="fbg", sites_mm=(10.0,)), {"device": DEVICE}, "fbg of the scenario"),
     ],
 )
 def test_invalid_settings_are_one_line(sensor, settings, line):
@@ -226,14 +222,11 @@ def test_readings_that_nobody_reads_are_bounded():
     stamps = count(1)
 
     def messages():
-        return [
-            pyigtl.PointMessage([(1.0, 2.0, 3.0)], device_name=DEVICE, timestamp=1e3 + next(stamps)).pack()
-            for _ in range(300)
-        ]
+        times = (1e3 + next(stamps) for _ in range(300))
+        return [pyigtl.PointMessage([PLACES[0]], device_name=DEVICE, timestamp=at).pack() for at in times]
 
-    with (
-        PlusServer(messages) as server,
-        make_sensor({"device": DEVICE, "port": server.port}, WallClock(), POINTS) as sensor,
-    ):
-        until(lambda: sensor._reader.number > 2000)
-        assert len(sensor.read()) <= 1000
+    with PlusServer(messages) as server:
+        settings = {"device": DEVICE, "port": server.port}
+        with make_sensor(settings, WallClock(), POINTS) as sensor:
+            until(lambda: sensor._reader.number > 2000)
+            assert len(sensor.read()) <= 1000

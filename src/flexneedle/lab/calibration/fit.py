@@ -103,13 +103,10 @@ class Problem:
 
     def with_means(self, shapes: Floats) -> "Problem":
         """Return the problem with the readings of the sensors, at needles with shapes (n, k, nodes, 5)."""
-        means = [
-            each
-            for n, one in enumerate(self.replay.recordings if self.sensors else ())
-            for each in read_means(
-                n, one, self._along[self.sessions.index(one.session)][0], shapes[n], self.length
-            )
-        ]
+        means = list[StepMeans]()
+        for n, one in enumerate(self.replay.recordings):
+            sensors = self._along[self.sessions.index(one.session)][0]
+            means += read_means(n, one, sensors, shapes[n], self.length)
         return replace(self, means=tuple(means))
 
     @property
@@ -171,15 +168,11 @@ def residuals_at(problem: Problem, point: Floats, *, derivatives: bool = True) -
             values.append((found - model)[known])
             slopes.append(derivative[known])
             models.append(model)
-    recordings, length = problem.replay.recordings, problem.length
-    along = [
-        residuals_along(
-            each, recordings[each.recording], shapes[:, each.recording], length, signs * steps, point
-        )
-        for each in problem.means
-    ]
-    none = shapes[0] if problem.sensors else shapes
-    return Residuals(values, slopes, models, tips[0], bool(good.all()), along, none)
+    along = []
+    for each in problem.means:
+        one, own = problem.replay.recordings[each.recording], shapes[:, each.recording]
+        along.append(residuals_along(each, one, own, problem.length, signs * steps, point))
+    return Residuals(values, slopes, models, tips[0], bool(good.all()), along, shapes[0])
 
 
 def paths_at(problem: Problem, tips: Floats) -> list[Whitened]:
@@ -199,18 +192,12 @@ def paths_along(problem: Problem, found: Residuals) -> list[AlongPath]:
     """Return the covariances of each sensor along the needle in each recording about the model's needles."""
     recordings, target = problem.replay.recordings, problem.scenario.target.depth_mm
     sessions = Counter(one.session for one in recordings)
-    return [
-        path_along(
-            means,
-            recordings[means.recording],
-            found.shapes[means.recording],
-            problem.length,
-            target,
-            each,
-            sessions[recordings[means.recording].session],
-        )
-        for means, each in zip(problem.means, found.along, strict=True)
-    ]
+    paths = []
+    for means, each in zip(problem.means, found.along, strict=True):
+        one, shapes = recordings[means.recording], found.shapes[means.recording]
+        alike = sessions[one.session]
+        paths.append(path_along(means, one, shapes, problem.length, target, each, alike))
+    return paths
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,7 +92,7 @@ class Replay:
     def carry_out(
         self, needles: Sequence[Needle], outputs: tuple[str, ...] = ()
     ) -> tuple[Floats, Flags, Floats]:
-        """Return as `predict`, and the poses (v, n, k, nodes, 5) of needles if outputs has "shapes", else none."""
+        """Return as `predict`, and the poses (v, n, k, nodes, 5) of needles; without "shapes" in outputs no nodes."""
         states, models = [], []
         zero = (0.0,) * self.axes
         for needle in needles:
@@ -104,12 +104,9 @@ class Replay:
         out = needles[0].simulator.rollout(states, rows, models=models, limits=False, outputs=outputs)
         shape = len(needles), len(self.recordings), len(self._ends)
         good = np.logical_and.reduce(np.asarray(out.converged).reshape(*shape[:2], -1), axis=2)
-        shapes = out.shapes[:, self._ends] if outputs else np.zeros((0, 1, 2, 5))
-        return (
-            out.tips[:, self._ends].reshape(*shape, 5),
-            good,
-            shapes.reshape(-1, *shape[1:], *shapes.shape[-2:]) if outputs else shapes,
-        )
+        nodes = out.shapes.shape[-2] if outputs else 0
+        shapes = out.shapes[:, self._ends] if outputs else np.zeros(0)
+        return out.tips[:, self._ends].reshape(*shape, 5), good, shapes.reshape(*shape, nodes, 5)
 
     def corrected(self, tips: Floats) -> "Replay":
         """Return the replay with the advances corrected by the depths of the tips (n, k, 5) that it has led to."""

@@ -6,11 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flexneedle.errors import InputError
 from flexneedle.lab.calibration.readings import StepReading
 from flexneedle.lab.calibration.session import Recording, Session
 from flexneedle.phantom.draw import Truth
-from flexneedle.phantom.phantom import to_poses
+from flexneedle.phantom.phantom import poses_of
 from flexneedle.phantom.plants import ExactPlant, Plant, PlantFactory
 from flexneedle.phantom.tracking.along import VirtualSensor
 from flexneedle.types import COLUMNS, DB_X, DG_Y, Floats, Point, Pose
@@ -86,7 +85,7 @@ class Rehearsal:
             for _ in rests(plant, schedule, begin):
                 tips.append(plant.tip)
                 if self.truth.scenario.sensor:
-                    poses.append(_poses_of(plant))
+                    poses.append(poses_of(plant))
             recordings.append(self._record(np.array(tips), schedule, name, f"{k:02}"))
         return Session(tuple(self._measure(recordings, Rests(poses))), "before")
 
@@ -166,14 +165,6 @@ def rests(plant: Plant, schedule: Schedule, start: float) -> Iterator[None]:
         row[DB_X] = advance
         _move(plant, row, abs(advance) / _ADVANCE_MM)
         yield
-
-
-def _poses_of(plant: Plant) -> Floats:
-    """Return the poses (n, 5) of a needle. Raises InputError for a plant without nodes."""
-    nodes = getattr(plant, "nodes", None)
-    if nodes is None:
-        raise InputError(f"plant = {type(plant).__name__}: without nodes no [[sensor]] can measure it")
-    return to_poses(nodes)
 
 
 def _move(plant: Plant, row: Floats, parts: float) -> None:

@@ -6,7 +6,8 @@ import argparse
 import json
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.arguments import expand_home
@@ -17,6 +18,7 @@ from flexneedle.cli.values import port
 
 if TYPE_CHECKING:
     from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
+    from flexneedle.lab.emulators.galil.galil_server import TcpServer
     from flexneedle.lab.emulators.orders import Orders
 
 
@@ -181,42 +183,42 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
 
 
 def _emulate_galil(args: argparse.Namespace) -> int:
-    from time import monotonic
-
-    from flexneedle.lab.emulators.faults import parse_fault
+    from flexneedle.lab.emulators.galil import galil_server
     from flexneedle.lab.emulators.galil.controller import ControllerState
-    from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession, TcpServer, execute, serve
-    from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
-    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
-    with TcpServer(args.host, args.port) as tcp:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        set_realtime_priority()  # a real device does not wait for other processes on this machine
-        try:
-            print("{}:{}".format(*tcp.address), flush=True)
-            session = GalilSession(ControllerState(), faults, monotonic(), args.seed)
-            serve(session, tcp, _orders(), lambda line: print_line(execute(session, line)), print_line)
-        except KeyboardInterrupt:
-            return 0
+    make_session = partial(galil_server.GalilSession, ControllerState())
+    return _serve_on_tcp(args, galil_server, galil_server.TcpServer, make_session)
 
 
 def _emulate_fbgs(args: argparse.Namespace) -> int:
+    from flexneedle.lab.emulators import fbgs
+
+    return _serve_on_tcp(args, fbgs, fbgs.FbgsServer, fbgs.FbgsSession)
+
+
+def _serve_on_tcp(
+    args: argparse.Namespace, device: Any, server: type[TcpServer], make_session: Callable[..., Any]
+) -> int:
+    """Serve a device, a module with its faults and `serve`, until interrupted."""
     from time import monotonic
 
     from flexneedle.lab.emulators.faults import parse_fault
-    from flexneedle.lab.emulators.fbgs import FAULTS, FbgsServer, FbgsSession, execute, serve
     from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
-    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
-    with FbgsServer(args.host, args.port) as tcp:
+    faults = [parse_fault(spec, device.FAULTS) for spec in args.fault]
+    with server(args.host, args.port) as tcp:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print("{}:{}".format(*tcp.address), flush=True)
-            session = FbgsSession(faults, monotonic(), args.seed)
-            serve(session, tcp, _orders(), lambda line: print_line(execute(session, line)), print_line)
+            session = make_session(faults, monotonic(), args.seed)
+            obey = session.schedule.execute
+            device.serve(
+                session, tcp, _orders(), lambda line: print_line(obey(line, monotonic())), print_line
+            )
         except KeyboardInterrupt:
-            return 0
+            pass
+    return 0
 
 
 def _emulate_rig(args: argparse.Namespace) -> int:

@@ -154,6 +154,13 @@ class FaultSchedule:
         self.ordered = (*kept, fault)
         return f"{fault.kind}{fault.detail and '='}{fault.detail}"
 
+    def execute(self, line: str, now: float) -> str:
+        """Obey a line; return a message about it, or the error."""
+        try:
+            return f"{self.obey(line, now)} from now on"
+        except InputError as error:
+            return str(error)
+
 
 def reply_time(now: float, faults: Mapping[str, Fault]) -> float:
     """Return the time of a reply (s) to a command received at `now`, with the faults by kind."""

@@ -15,16 +15,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from flexneedle.errors import InputError
-from flexneedle.lab.emulators.faults import (
-    SECONDS,
-    Fault,
-    FaultKind,
-    FaultSchedule,
-    damage_reply,
-    is_order,
-    reply_time,
-)
+from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, FaultSchedule, damage_reply, reply_time
 from flexneedle.lab.emulators.galil.galil_server import TcpServer
 from flexneedle.lab.emulators.orders import OrderSource
 from flexneedle.types import Floats
@@ -35,8 +26,7 @@ POSITIONS_MM = tuple(184.8 - 10.0 * n for n in range(18))
 UNUSED = 2
 """Number of values before the first grating."""
 
-_SPECTRUM = 630  # values
-_CORES = 4
+_SPECTRA_BYTES = 15_220  # of four cores, 630 wavelengths and powers each
 _TICK_S = 0.01
 _MOST_UNSENT = 1 << 16
 
@@ -75,7 +65,7 @@ def encode_frame(line: int, stamp: float, bends: Floats, *, error: int = 0, fibr
         *(struct.pack("<I", values.shape[1]) + one.astype("<f4").tobytes() for one in arrays),
         struct.pack("<II", 3, 19) + bytes(4 * 3 * 19),
         struct.pack("<I", values.shape[1]) + np.full(values.shape[1], 20.0, "<f4").tobytes(),
-        b"".join(_SPECTRA),
+        bytes(_SPECTRA_BYTES),
     )
     payload = bytes([fibre]) + b"".join(_field(kind, content) for kind, content in enumerate(fields))
     return struct.pack("<I", len(payload)) + payload
@@ -83,16 +73,6 @@ def encode_frame(line: int, stamp: float, bends: Floats, *, error: int = 0, fibr
 
 def _field(kind: int, content: bytes) -> bytes:
     return struct.pack("<iH", len(content) + 2, kind) + content
-
-
-def _spectrum(core: int) -> bytes:
-    """Return a block of the spectra, of zeros: wavelengths and powers of a core."""
-    parts = _field(3, struct.pack(f"<I{_SPECTRUM}I", _SPECTRUM, *bytes(_SPECTRUM)))
-    parts += _field(4, struct.pack(f"<I{_SPECTRUM}H", _SPECTRUM, *bytes(_SPECTRUM)))
-    return struct.pack("<IB", 1 + len(parts), core) + parts
-
-
-_SPECTRA = tuple(map(_spectrum, range(_CORES)))
 
 
 @dataclass
@@ -196,13 +176,3 @@ def advance(session: FbgsSession, tcp: FbgsServer, now: float, say: Callable[[st
         session.schedule.since = now
     for data in session.take_due(now):
         tcp.send(data)
-
-
-def execute(session: FbgsSession, order: str) -> str:
-    """Inject the fault in a line; return a message about it, or the error."""
-    try:
-        if not is_order(order):
-            raise InputError(f"{order.strip()!r}: must be fault KIND[=DETAIL][:DURATION], or clear")
-        return f"{session.schedule.obey(order, monotonic())} from now on"
-    except InputError as error:
-        return str(error)

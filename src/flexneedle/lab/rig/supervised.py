@@ -254,7 +254,7 @@ class SupervisedRig(RigSource):
         clock = WallClock(start=task.started)
         with (
             SupervisorClient(task, report) as supervisor,
-            open_sensors(() if self.dry_run else rig.sensor, scenario.sensor, clock, scenario) as sensors,
+            open_sensors(() if self.dry_run else rig.sensor, scenario, clock) as sensors,
         ):
             # An insertion without room is refused before anybody is asked.
             check_room(supervisor, scenario, plan, dry=self.dry_run)

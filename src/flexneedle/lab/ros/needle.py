@@ -56,5 +56,5 @@ def pose_to_point(frame: FrameMap, pose: Any) -> Point:
 
 
 def is_unfilled(pose: Any) -> bool:
-    """Return whether all numbers of a pose are 0, which none is that was measured."""
+    """Return True if all numbers of a pose are 0, as in no measured one."""
     return not any(getattr(part, axis, 0.0) for part in (pose.position, pose.orientation) for axis in "xyzw")

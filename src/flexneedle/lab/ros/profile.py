@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Iterator
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -25,6 +25,8 @@ PROFILES = Library("a profile of ROS topics", "profile", files(__package__) / "p
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LONGEST = 200
 _SENSORS = "sensors."
+
+Keys = Collection[str]
 
 
 def _check_name(name: str) -> str:
@@ -93,13 +95,14 @@ class ShapeTopic(PlacedTopic):
     """Distance of the poses along the needle, counted from the tip (default: the nodes of the model)."""
 
 
-CURVATURES, SHAPE, POINT, POSE = (
+SensorType = Literal[
     "std_msgs/msg/Float64MultiArray",
     "geometry_msgs/msg/PoseArray",
     "geometry_msgs/msg/PointStamped",
     "geometry_msgs/msg/PoseStamped",
-)
+]
 """Types of the topics of sensors along the needle."""
+CURVATURES, SHAPE, POINT, POSE = get_args(SensorType)
 
 
 class SensorTopic(PlacedTopic):
@@ -108,12 +111,7 @@ class SensorTopic(PlacedTopic):
     Two devices of a rig must not read topics with a common source: a shape is computed from curvatures.
     """
 
-    type: Literal[
-        "std_msgs/msg/Float64MultiArray",
-        "geometry_msgs/msg/PoseArray",
-        "geometry_msgs/msg/PointStamped",
-        "geometry_msgs/msg/PoseStamped",
-    ]
+    type: SensorType
     """Type of its messages: curvatures at gratings, points along the needle, or one point."""
     frame: str = ""
     """Name of the frame among `frames`; not for curvatures, which are in a frame that rolls with the needle."""
@@ -267,16 +265,10 @@ class TopicProfile(Section):
         same = (one.sources for one in self.sensors.values() if one.topic == topic.topic)
         return {topic.topic, *({_namespace(topic.topic)} if kind == SHAPE else ())}.union(*same)
 
-    def select(
-        self,
-        *,
-        publish: Collection[str] = (),
-        subscribe: Collection[str] = (),
-        sensors: Collection[str] = (),
-    ) -> "TopicProfile":
+    def select(self, *, publish: Keys = (), subscribe: Keys = (), sensors: Keys = ()) -> "TopicProfile":
         """Return the profile with these keys alone."""
 
-        def reduce(part: Section, keys: Collection[str]) -> Section:
+        def reduce(part: Section, keys: Keys) -> Section:
             return part.model_copy(update={key: None for key in type(part).model_fields if key not in keys})
 
         parts = {"publish": reduce(self.publish, publish), "subscribe": reduce(self.subscribe, subscribe)}
@@ -310,13 +302,7 @@ def load_profile(source: str | Path) -> TopicProfile:
     return PROFILES.load(source, TopicProfile)
 
 
-def load_part(
-    name: str,
-    *,
-    publish: Collection[str] = (),
-    subscribe: Collection[str] = (),
-    sensors: Collection[str] = (),
-) -> TopicProfile:
+def load_part(name: str, *, publish: Keys = (), subscribe: Keys = (), sensors: Keys = ()) -> TopicProfile:
     """Return a profile reduced to some keys. Raises RigError if it lacks one."""
     profile = load_profile(name)
     known = dict(profile.list_topics())

@@ -48,13 +48,8 @@ class VirtualSensor:
     ) -> None:
         # Each quantity has its own generator, so that a change of one does not change the others.
         places, errors, self._rng, faults = rng.spawn(4)
-        self._sensor, self._phantom, self._axes, self._depth, self._length = (
-            sensor,
-            phantom,
-            axes,
-            depth,
-            length,
-        )
+        self._sensor, self._phantom = sensor, phantom
+        self._axes, self._depth, self._length = axes, depth, length
         self._mounted = sensor.mounted(places)
         pairs = axes if sensor.paired else 1
         self._gain = 1.0 + np.repeat(errors.normal(0.0, sensor.gain_sd, sensor.size(axes) // pairs), pairs)

@@ -3,19 +3,12 @@
 A zone is a table `[[zone]]` of the scenario. A new shape is a class here and its distance in `mechanics.zones`.
 """
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    SerializeAsAny,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-)
+from pydantic import AfterValidator, Field, SerializeAsAny, ValidatorFunctionWrapHandler, WrapValidator
 
-from flexneedle.scenario.problems import Problem, problems_of, refuse
+from flexneedle.scenario.kind_tables import read_table
+from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.sections.environment import Direction, Vector
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title, one_line
 from flexneedle.scenario.sections.registration import UnitQuaternion
@@ -133,19 +126,13 @@ _SHAPES: dict[str, type[Zone]] = {
 
 def _zone(value: Any, _validate: ValidatorFunctionWrapHandler) -> Zone:
     """Return the zone of the shape in a table."""
-    if isinstance(value, Zone):
-        return value
-    if not isinstance(value, Mapping):
-        raise ValueError("must be a table")
-    name = value.get("shape")
-    if name is None or not isinstance(name, str) or name not in _SHAPES:
+    return read_table(value, Zone, lambda table: _choose_shape(table.get("shape")))
+
+
+def _choose_shape(name: object) -> type[Zone]:
+    if str(name) not in _SHAPES:
         refuse([Problem("shape", name, f"must be one of {', '.join(_SHAPES)}")])
-    shape = _SHAPES[str(name)]
-    try:
-        return shape.model_validate(dict(value))
-    except ValidationError as error:
-        refuse(problems_of(error, shape))
-        raise
+    return _SHAPES[str(name)]
 
 
 if TYPE_CHECKING:

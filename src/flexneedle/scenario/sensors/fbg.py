@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flexneedle.scenario.sections.fields import NonNegative, Positive
-from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors, perturbed
+from flexneedle.scenario.sensors.sensor import KeyedSensor, Keys, SensorErrors, perturbed
 from flexneedle.types import THETA, Needles, Y
 
 if TYPE_CHECKING:
@@ -28,10 +28,11 @@ class FbgErrors(SensorErrors):
     """Largest displacement of each site along the needle."""
 
 
-class Fbg(Sensor):
+class Fbg(KeyedSensor):
     """One `[[sensor]]` with `kind = "fbg"`."""
 
     paired, rolls = True, True
+    keys = Keys("noise_per_m", "bias_per_m", "wander_per_m", "1/m", _PER_M)
 
     kind: Literal["fbg"]
     sites_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=1000)]
@@ -67,24 +68,9 @@ class Fbg(Sensor):
         return sites
 
     @property
-    def noise(self) -> float:
-        """Standard deviation of the white noise, 1/mm."""
-        return _PER_M * self.noise_per_m
-
-    @property
-    def offset_sd(self) -> float:
-        """Prior standard deviation of the constant error, 1/mm."""
-        return _PER_M * self.bias_per_m
-
-    @property
     def drift_sd(self) -> float:
         """Standard deviation of the drift down to the target's depth, 1/mm."""
         return _PER_M * self.temperature_per_m
-
-    @property
-    def wander_sd(self) -> float:
-        """Standard deviation of the correlated noise, 1/mm."""
-        return _PER_M * self.wander_per_m
 
     def size(self, axes: int) -> int:
         """Return the number of curvatures."""

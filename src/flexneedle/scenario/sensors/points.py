@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive
 from flexneedle.scenario.sensors.crossing import cross, passed, to_stations
-from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors
+from flexneedle.scenario.sensors.sensor import KeyedSensor, Keys, SensorErrors
 from flexneedle.types import Matrix, Needles, Reading, X
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class PlaceErrors(SensorErrors):
     """Largest displacement of all points, on each axis."""
 
 
-class Range(Sensor):
+class Range(KeyedSensor):
     """A sensor that measures the needle from one x to another."""
 
     from_mm: Coordinate = 0.0
@@ -49,6 +49,7 @@ class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
 
     paired = True
+    keys = Keys("noise_mm", "place_sd_mm", "wander_mm", "mm")
 
     kind: Literal["points"]
     rate_hz: Positive = 2.0
@@ -67,21 +68,6 @@ class Points(Range):
     def stations(self) -> "Floats":
         """X (s,) at which readings are compared; a point is shifted to the nearest along the predicted needle."""
         return np.linspace(self.from_mm, self.to_mm, _STATIONS)
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the white noise, mm."""
-        return self.noise_mm
-
-    @property
-    def offset_sd(self) -> float:
-        """Prior standard deviation of the constant error, mm."""
-        return self.place_sd_mm
-
-    @property
-    def wander_sd(self) -> float:
-        """Standard deviation of the correlated noise, mm."""
-        return self.wander_mm
 
     def size(self, axes: int) -> int:
         """Return the number of coordinates across the needle."""

@@ -11,7 +11,7 @@ methods.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -59,6 +59,16 @@ class SensorErrors(Section):
     """Not set: none."""
 
 
+class Keys(NamedTuple):
+    """Keys of a kind for its noise, offset and wander, with their unit, and its size in the unit of the values."""
+
+    noise: str = ""
+    offset: str = ""
+    wander: str = ""
+    unit: str = ""
+    size: float = 1.0
+
+
 class Sensor(Section):
     """One `[[sensor]]`. A kind is a subclass with its keys, `noise` and `predict`; all else has a default.
 
@@ -69,6 +79,8 @@ class Sensor(Section):
     """True: values are lateral quantities: y in the plane, in space y and z, one after the other, as a vector."""
     rolls: ClassVar[bool] = False
     """True: the sensor is in the needle and rolls with it. Its values are `paired`."""
+    keys: ClassVar[Keys] = Keys()
+    """Names for the results of `flexneedle sensor check`."""
 
     kind: str
     """`fbg`, `slice`, `points`, `view` or `module:NAME`."""
@@ -174,6 +186,28 @@ class Sensor(Section):
     def drawn_offset(self, rng: np.random.Generator, axes: int) -> "Floats":
         """Return the offset (d,) of the virtual sensor."""
         return rng.normal(0.0, self.offset_sd, self.size(axes))
+
+
+class KeyedSensor(Sensor):
+    """A kind whose `keys` give the sizes of its errors."""
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the white noise of a value."""
+        return self._size(self.keys.noise)
+
+    @property
+    def offset_sd(self) -> float:
+        """Prior standard deviation of the constant error of a value."""
+        return self._size(self.keys.offset)
+
+    @property
+    def wander_sd(self) -> float:
+        """Standard deviation of the correlated noise of a value."""
+        return self._size(self.keys.wander)
+
+    def _size(self, key: str) -> float:
+        return self.keys.size * float(getattr(self, key))
 
 
 def flatten(rows: Matrix, size: int, width: int | None) -> "Floats":

@@ -9,7 +9,7 @@ from pydantic import Field, PrivateAttr
 from flexneedle.scenario.sections.environment import Direction
 from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive
 from flexneedle.scenario.sensors.crossing import cross, passed
-from flexneedle.scenario.sensors.sensor import Sensor, SensorErrors
+from flexneedle.scenario.sensors.sensor import KeyedSensor, Keys, SensorErrors
 from flexneedle.types import Matrix, Needles, Reading
 
 if TYPE_CHECKING:
@@ -30,10 +30,11 @@ class PlaneErrors(SensorErrors):
     """Largest rotation of the image, about each axis."""
 
 
-class Slice(Sensor):
+class Slice(KeyedSensor):
     """One `[[sensor]]` with `kind = "slice"`."""
 
     paired = True
+    keys = Keys("noise_mm", "pose_sd_mm", "wander_mm", "mm")
 
     kind: Literal["slice"]
     plane_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -53,21 +54,6 @@ class Slice(Sensor):
     phantom: PlaneErrors = PlaneErrors()
     _shift: Any = PrivateAttr((0.0, 0.0, 0.0))  # of the true image (mm)
     _turn: Any = PrivateAttr((0.0, 0.0, 0.0))  # its rotation vector (rad)
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the white noise, mm."""
-        return self.noise_mm
-
-    @property
-    def offset_sd(self) -> float:
-        """Prior standard deviation of the constant error, mm."""
-        return self.pose_sd_mm
-
-    @property
-    def wander_sd(self) -> float:
-        """Standard deviation of the correlated noise, mm."""
-        return self.wander_mm
 
     @property
     def frame(self) -> "Floats":
@@ -90,7 +76,7 @@ class Slice(Sensor):
         return cross(along, across[..., :axes], np.zeros(1))[:, 0]
 
     def sees(self, needles: Needles, axes: int) -> "Flags":
-        """Return whether needles have passed the plane (m, axes)."""
+        """Return flags (m, axes): True for needles that have passed the plane."""
         return passed(self._in_frame(needles.points)[0], np.zeros(1), axes)
 
     def model_error(self, values: "Floats") -> "Floats":

@@ -6,9 +6,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flexneedle.scenario.problems import Problem, refuse
-from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive
+from flexneedle.scenario.sections.fields import NonNegative, Positive
 from flexneedle.scenario.sensors.crossing import cross, passed, to_stations
-from flexneedle.scenario.sensors.points import Range
+from flexneedle.scenario.sensors.points import Coordinate, Range
+from flexneedle.scenario.sensors.sensor import Keys
 from flexneedle.types import Matrix, Needles, Reading
 
 if TYPE_CHECKING:
@@ -20,8 +21,7 @@ if TYPE_CHECKING:
 _STATIONS = 12
 _MODEL_MM = 0.03
 
-Entry = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-Row = Annotated[tuple[Entry, Entry, Entry, Entry], Field(strict=False)]
+Row = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Field(strict=False)]
 
 
 class View(Range):
@@ -29,6 +29,8 @@ class View(Range):
 
     A value is a coordinate across the insertion axis in the image; coordinates along it are not used.
     """
+
+    keys = Keys("noise_px", "pose_sd_px", "wander_px", "px")
 
     kind: Literal["view"]
     projection: Annotated[
@@ -48,26 +50,13 @@ class View(Range):
 
     @model_validator(mode="after")
     def _sees_the_axis(self) -> Self:
-        depth = np.array([[self.from_mm, 0.0, 0.0, 1.0], [self.to_mm, 0.0, 0.0, 1.0]]) @ np.array(
-            self.projection[2]
-        )
-        if depth.prod() <= 0.0:
-            refuse(
-                [
-                    Problem(
-                        "projection", self.projection[2], "the insertion axis must be in front of the camera"
-                    )
-                ]
-            )
-        start, end = self._pixels(np.array([[self.from_mm, 0.0, 0.0], [self.to_mm, 0.0, 0.0]]))
-        if np.linalg.norm(end - start) < 1.0:
-            refuse(
-                [
-                    Problem(
-                        "projection", self.projection[0], "must show the insertion axis longer than a pixel"
-                    )
-                ]
-            )
+        image = np.array(self.projection) @ [[self.from_mm, self.to_mm], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0]]
+        if image[2].prod() <= 0.0:
+            rule = "the insertion axis must be in front of the camera"
+            refuse([Problem("projection", self.projection[2], rule)])
+        if np.linalg.norm(np.diff(image[:2] / image[2])) < 1.0:
+            rule = "must show the insertion axis longer than a pixel"
+            refuse([Problem("projection", self.projection[0], rule)])
         return self
 
     def _pixels(self, points: "Floats") -> "Floats":
@@ -95,21 +84,6 @@ class View(Range):
     def stations(self) -> "Floats":
         """Pixels (s,) along the axis at which readings are compared."""
         return np.linspace(0.0, self._axis[2], _STATIONS)
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the white noise, pixels."""
-        return self.noise_px
-
-    @property
-    def offset_sd(self) -> float:
-        """Prior standard deviation of the constant error, pixels."""
-        return self.pose_sd_px
-
-    @property
-    def wander_sd(self) -> float:
-        """Standard deviation of the correlated noise, pixels."""
-        return self.wander_px
 
     def size(self, axes: int) -> int:
         """Return the number of stations."""

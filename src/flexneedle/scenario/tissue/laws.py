@@ -1,17 +1,13 @@
 """The laws by name, and the layers of a scenario, each by its law. A new law is a file here with a `Layer` subclass."""
 
-from collections.abc import Mapping
-from importlib import import_module
-from pathlib import Path
-from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import numpy as np
-from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import SerializeAsAny, ValidatorFunctionWrapHandler, WrapValidator
 
-from flexneedle.errors import InputError, make_printable
-from flexneedle.plugins import load_part
-from flexneedle.scenario.problems import Problem, problems_of, refuse
+from flexneedle.errors import make_printable
+from flexneedle.scenario.kind_tables import choose_kind, find_kinds, read_table
+from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.tissue.layer import Layer
 
 DEFAULT = "ogden"
@@ -19,58 +15,18 @@ _FUNCTIONS = ("energy", "force", "stiffness")
 _POINTS = 4097  # at which a custom law is checked
 _AGREEMENT = 0.01  # relative difference of a function and the integral of the next
 
-
-def _is_law(value: object) -> bool:
-    return isinstance(value, type) and issubclass(value, Layer) and value is not Layer
-
-
-def _find_laws() -> dict[str, type[Layer]]:
-    """Return the layers in the files of this folder whose `law` is the name of the file, by this name."""
-    package = __name__.rpartition(".")[0]
-    laws: dict[str, type[Layer]] = {}
-    for file in iter_modules([str(Path(__file__).parent)]):
-        if file.name != "laws":
-            for law in vars(import_module(f"{package}.{file.name}")).values():
-                if _is_law(law) and get_args(law.model_fields["law"].annotation) == (file.name,):
-                    laws[file.name] = law
-    return laws
-
-
-LAWS = _find_laws()
+LAWS = find_kinds(__name__, Layer, "law")
 
 
 def _layer(value: Any, _validate: ValidatorFunctionWrapHandler) -> Layer:
     """Return the layer of the law in a table."""
-    if isinstance(value, Layer):
-        return value
-    if not isinstance(value, Mapping):
-        raise ValueError("must be a table")
-    law = _law(value.get("law", DEFAULT))
-    try:
-        layer = law.model_validate(dict(value))
-    except ValidationError as error:
-        refuse(problems_of(error, law))
-        raise
-    if law not in LAWS.values() and (rule := _broken_rule(layer)):
+    needed = "limit", *_FUNCTIONS
+    layer = read_table(
+        value, Layer, lambda table: choose_kind(Layer, "law", table.get("law", DEFAULT), LAWS, needed)
+    )
+    if layer is not value and type(layer) not in LAWS.values() and (rule := _broken_rule(layer)):
         refuse([Problem("law", value["law"], rule)])
     return layer
-
-
-def _law(name: object) -> type[Layer]:
-    law: Any = None
-    if not isinstance(name, str):
-        refuse([Problem("law", name, "must be text in quotes")])
-    try:
-        law = LAWS[str(name)] if name in LAWS else load_part(str(name), LAWS)
-    except InputError as error:
-        refuse([Problem("law", name, str(error))])
-    if not _is_law(law):
-        refuse([Problem("law", name, "must be a subclass of flexneedle.Layer")])
-    missing = law.__abstractmethods__
-    if lacking := [part for part in ("limit", *_FUNCTIONS) if part in missing or not hasattr(law, part)]:
-        refuse([Problem("law", name, f"must define {', '.join(lacking)}")])
-    found: type[Layer] = law
-    return found
 
 
 def _broken_rule(layer: Layer) -> str:

@@ -31,12 +31,9 @@ def import_recordings(files: Sequence[Path], recording_map: RecordingMap | None 
 
     Raises InputError, in one line, for files that contradict themselves, each other or the map.
     """
-    beside = {
-        each.path(path).resolve()
-        for each in (recording_map.sensor if recording_map else ())
-        for path in files
-        if each.path(path) != path
-    }
+    sensors = recording_map.sensor if recording_map else ()
+    pairs = [(path, each.path(path)) for each in sensors for path in files]
+    beside = {table.resolve() for path, table in pairs if table != path}
     sources = _name_sessions(_in_natural_order([path for path in files if path.resolve() not in beside]))
     runs = [(folder, session) for path, session in sources if (folder := find_run(path)) is not None]
     tables = [(path, session) for path, session in sources if find_run(path) is None]

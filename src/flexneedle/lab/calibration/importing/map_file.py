@@ -262,11 +262,6 @@ class SensorMap(Section):
         """Names of the columns of numbers, without their signs."""
         return tuple(dict.fromkeys(map(to_name, self.values)))
 
-    @property
-    def text(self) -> tuple[str, ...]:
-        """Names of the columns of text: none."""
-        return ()
-
     def path(self, tip: Path) -> Path:
         """Return the file of the sensor for the tip's file."""
         return tip.parent / self.file.replace("{name}", tip.stem).replace("{suffix}", tip.suffix)

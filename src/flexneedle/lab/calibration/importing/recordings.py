@@ -129,18 +129,8 @@ def _recording(rows: Rows, frame: Rigid, recording_map: RecordingMap) -> tuple[R
     slope = _slopes(rows, frame, position)[:, :axes]
     origin = np.array([skin, *position[0, 1:]])
     readings, unread = _read_steps(rows, frame, origin, recording_map)
-    made = Recording(
-        rows.session,
-        rows.name,
-        rows.time,
-        depth,
-        lateral[0],
-        slope,
-        lateral[1],
-        lateral[2],
-        rows.roll,
-        readings,
-    )
+    head = rows.session, rows.name, rows.time, depth
+    made = Recording(*head, lateral[0], slope, lateral[1], lateral[2], rows.roll, readings)
     return made, [*([note] if note else []), *unread]
 
 
@@ -155,10 +145,8 @@ def _read_steps(
         own = [*in_needle_frame(table, given, frame, origin).at_steps(rows.time)]
         found += own
         if not own:
-            notes.append(
-                f"{rows.source}: no reading of {given.name} within {given.within_s:g} s of a step: check its "
-                "time, or set within_s"
-            )
+            near = f"no reading of {given.name} within {given.within_s:g} s of a step"
+            notes.append(f"{rows.source}: {near}: check its time, or set within_s")
     return tuple(found), notes
 
 

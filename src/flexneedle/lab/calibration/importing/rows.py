@@ -12,7 +12,7 @@ from flexneedle.lab.calibration.importing.bags import TIME
 from flexneedle.lab.calibration.importing.columns import Table
 from flexneedle.lab.calibration.importing.map_file import ANGLES, LENGTHS, RecordingMap, StageMap, to_name
 from flexneedle.lab.calibration.importing.sensor_tables import read_sensors
-from flexneedle.lab.calibration.importing.tables import read_table
+from flexneedle.lab.calibration.importing.tables import Columns, read_table
 from flexneedle.lab.calibration.readings import SensorTable
 from flexneedle.types import Floats
 
@@ -78,8 +78,8 @@ def read_rows(path: Path, session: str, recording_map: RecordingMap) -> Iterator
 
     Raises InputError.
     """
-    columns = read_table(path, recording_map)
     table, tip = recording_map.table, recording_map.tip
+    columns = read_table(path, Columns(recording_map.numbers, recording_map.text, recording_map.time, table))
     try:
         whole = _whole(columns, recording_map)
     except InputError as error:

@@ -1,7 +1,6 @@
 """Tables of sensors along the needle beside the tip's: a reading is a row, or the rows of one time."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -10,29 +9,12 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.calibration.importing.bags import TIME
-from flexneedle.lab.calibration.importing.map_file import (
-    LENGTHS,
-    RecordingMap,
-    SensorMap,
-    TableMap,
-    TimeMap,
-    to_name,
-)
-from flexneedle.lab.calibration.importing.tables import read_table
+from flexneedle.lab.calibration.importing.map_file import LENGTHS, RecordingMap, SensorMap, to_name
+from flexneedle.lab.calibration.importing.tables import Columns, read_table
 from flexneedle.lab.calibration.readings import SensorTable
 from flexneedle.types import Floats, Matrix
 
 _CURVATURES = {"1/m": 1e-3, "1/mm": 1.0}
-
-
-@dataclass(frozen=True)
-class _Columns:
-    """The columns of a sensor's table."""
-
-    numbers: tuple[str, ...]
-    time: TimeMap
-    table: TableMap
-    text: tuple[str, ...] = ()
 
 
 def read_sensors(path: Path, recording_map: RecordingMap) -> tuple[SensorTable, ...]:
@@ -43,7 +25,7 @@ def read_sensors(path: Path, recording_map: RecordingMap) -> tuple[SensorTable, 
 def _read(path: Path, tip: Path, given: SensorMap, recording_map: RecordingMap) -> SensorTable:
     own = path == tip
     table = recording_map.table.model_copy(update={"columns": recording_map.table.columns if own else ()})
-    columns = read_table(path, _Columns(given.numbers, given.time or recording_map.time, table))
+    columns = read_table(path, Columns(given.numbers, (), given.time or recording_map.time, table))
     if TIME not in columns:
         raise InputError(f"{path}: sensor {given.name} needs the time of each row: set time.columns")
     values = np.stack([_signed(columns[to_name(name)], name) for name in given.values], axis=1)

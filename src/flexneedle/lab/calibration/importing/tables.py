@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,47 +16,32 @@ from flexneedle.lab.calibration.importing.text_tables import read_text
 _PARQUET, _MAT, _HDF = b"PAR1", b"MATLAB 5.0 MAT-file", b"\x89HDF"
 
 
-class Columns(Protocol):
-    """The columns of a table: a `RecordingMap`, or a sensor's."""
+class Columns(NamedTuple):
+    """Names of columns of numbers and of text, columns of the time, and layout of the file."""
 
-    @property
-    def numbers(self) -> tuple[str, ...]:
-        """Names of the columns of numbers."""
-        ...
-
-    @property
-    def text(self) -> tuple[str, ...]:
-        """Names of the columns of text."""
-        ...
-
-    @property
-    def time(self) -> TimeMap:
-        """Columns of the time."""
-        ...
-
-    @property
-    def table(self) -> TableMap:
-        """Layout of the file."""
-        ...
+    numbers: tuple[str, ...]
+    text: tuple[str, ...]
+    time: TimeMap
+    table: TableMap
 
 
-def read_table(path: Path, recording_map: Columns) -> Table:
-    """Return the columns of a map: numbers, text, and `TIME` in s if the file has times.
+def read_table(path: Path, wanted: Columns) -> Table:
+    """Return columns: numbers, text, and `TIME` in s if the file has times.
 
     CSV and other text, Parquet, MATLAB, MCAP or rosbag2; the content of the file decides, not its name. Raises
     InputError, which begins with the path, for a file that cannot be read, and for missing or malformed columns.
     """
     try:
-        return dict(_convert(_read(path, recording_map), recording_map))
+        return dict(_convert(_read(path, wanted), wanted))
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
 
 
-def _read(path: Path, recording_map: Columns) -> Table:
-    times = tuple(map(to_name, recording_map.time.columns))
-    names = dict.fromkeys((*recording_map.numbers, *times, *recording_map.text))
+def _read(path: Path, wanted: Columns) -> Table:
+    times = tuple(map(to_name, wanted.time.columns))
+    names = dict.fromkeys((*wanted.numbers, *times, *wanted.text))
     if (bag := find_bag(path)) is not None:
         return read_bag(bag, list(names))
     with path.open("rb") as file:
@@ -69,14 +54,14 @@ def _read(path: Path, recording_map: Columns) -> Table:
         return _read_parquet(path, list(names))
     if start.startswith(_MAT):
         return _read_matlab(path, list(names))
-    return read_text(path, recording_map.numbers, times, recording_map.text, recording_map.table)
+    return read_text(path, wanted.numbers, times, wanted.text, wanted.table)
 
 
-def _convert(columns: Table, recording_map: Columns) -> Iterator[tuple[str, Any]]:
-    time = recording_map.time
-    for name in recording_map.text:
+def _convert(columns: Table, wanted: Columns) -> Iterator[tuple[str, Any]]:
+    time = wanted.time
+    for name in wanted.text:
         yield name, np.array(["" if each is None else str(each).strip() for each in columns[name].tolist()])
-    for name in recording_map.numbers:
+    for name in wanted.numbers:
         yield name, to_numbers(name, columns[name])
     units = zip(time.columns, (time.unit, time.second_unit), strict=False)
     found = [to_seconds(to_name(name), columns[to_name(name)], TIMES[unit]) for name, unit in units]

@@ -16,15 +16,7 @@ from typing import NoReturn, Self
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.lab.emulators.faults import (
-    SECONDS,
-    Fault,
-    FaultKind,
-    FaultSchedule,
-    damage_reply,
-    is_order,
-    reply_time,
-)
+from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, FaultSchedule, damage_reply, reply_time
 from flexneedle.lab.emulators.galil import motor_axis as one
 from flexneedle.lab.emulators.galil.axis_commands import ERRORS
 from flexneedle.lab.emulators.galil.controller import (
@@ -307,13 +299,3 @@ def serve(
         now = monotonic()
         session.advance(now)
         tcp.send_due(now)
-
-
-def execute(session: GalilSession, order: str) -> str:
-    """Inject the fault in a line; return a message about it, or the error."""
-    try:
-        if not is_order(order):
-            raise InputError(f"{order.strip()!r}: must be fault KIND[=DETAIL][:DURATION], or clear")
-        return f"{session.schedule.obey(order, monotonic())} from now on"
-    except InputError as error:
-        return str(error)

@@ -47,7 +47,7 @@ TrackerFactory = Callable[[Mapping[str, Any], Clock], Tracker]
 SensorFactory = Callable[[Mapping[str, Any], Clock, Sensor], NeedleSensor]
 """Makes a sensor along the needle from its settings, the clock of the run and the scenario's sensor; as a tracker.
 
-It may have a fourth parameter `scenario`, None without one.
+It may have a fourth parameter `scenario`, with a default.
 """
 
 Rule = Callable[[Any], str]
@@ -135,23 +135,13 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
 
 @contextmanager
 def open_sensors(
-    parts: Sequence[SensorSection],
-    sensors: Sequence[Sensor],
-    clock: Clock,
-    scenario: Scenario | None = None,
+    parts: Sequence[SensorSection], scenario: Scenario, clock: Clock
 ) -> Iterator[dict[str, OpenNeedleSensor]]:
-    """Open sensors along the needle, and yield them by name.
+    """Open sensors of a rig file, each of which the scenario has (`fit_problems`), and yield them by name.
 
-    Args:
-        parts: Sensors of a rig file.
-        sensors: Sensors of the scenario, one for each of the rig file (`fit_problems`).
-        clock: The clock of the run, on which readings have their times.
-        scenario: The scenario, for sensors that need its registration of the image.
-
-    Raises:
-        RigError, RunError, DriverError: As in `open_tracker`.
+    Their readings have times on `clock`. Raises as `open_tracker`.
     """
-    wanted = {one.title: one for one in sensors}
+    wanted = {one.title: one for one in scenario.sensor}
     with ExitStack() as stack:
         yield {
             one.name: stack.enter_context(closing(open_sensor(one, wanted[one.name], clock, scenario)))
@@ -159,9 +149,7 @@ def open_sensors(
         }
 
 
-def open_sensor(
-    part: SensorSection, sensor: Sensor, clock: Clock, scenario: Scenario | None = None
-) -> OpenNeedleSensor:
+def open_sensor(part: SensorSection, sensor: Sensor, clock: Clock, scenario: Scenario) -> OpenNeedleSensor:
     """Return a sensor along the needle, started; `close` stops it. Raises as `open_tracker`."""
     section = f"sensor {part.name}"
     factory = _load_factory(section, SENSORS, part, ("settings", "clock", "sensor"))

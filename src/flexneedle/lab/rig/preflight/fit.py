@@ -61,21 +61,14 @@ def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation
 def _sensor_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
     """Yield sensors along the needle that only the rig or only the scenario has, or whose data are used twice."""
     wanted, given = [one.title for one in scenario.sensor], [one.name for one in rig.sensor]
+    known = f"must be a sensor of the scenario, one of {', '.join(wanted)}"
     for n, name in enumerate(given):
         if name not in wanted:
-            rule = (
-                f"must be a sensor of the scenario, one of {', '.join(wanted)}"
-                if wanted
-                else "the scenario has no sensor"
-            )
-            yield Problem(("sensor", n, "name"), name, rule)
+            yield Problem(("sensor", n, "name"), name, known if wanted else "the scenario has no sensor")
     for name in wanted:
         if name not in given:
-            yield Problem(
-                "sensor",
-                None,
-                f'the rig has no device for {name}: add [[sensor]] with name = "{name}" to its file',
-            )
+            rule = f'the rig has no device for {name}: add [[sensor]] with name = "{name}" to its file'
+            yield Problem("sensor", None, rule)
     yield from source_problems(rig)
 
 

@@ -86,19 +86,20 @@ def check_rig(
         lambda: open_tracker(rig, clock),
         lambda t: check_tracker(rig, t, clock, seconds, wanted, rolls[-1]),
     )
-    for part in rig.sensor:
-        found += _sensor_part_findings(part, None if wanted is None else wanted.scenario, clock, seconds)
+    if wanted is not None:
+        for part in rig.sensor:
+            found += _sensor_part_findings(part, wanted.scenario, clock, seconds)
     return found
 
 
 def _sensor_part_findings(
-    part: SensorSection, scenario: Scenario | None, clock: Clock, seconds: float
+    part: SensorSection, scenario: Scenario, clock: Clock, seconds: float
 ) -> list[Finding]:
     """Return the findings of a sensor along the needle, none if it is no sensor of the scenario."""
-    sensors = () if scenario is None else scenario.sensor
-    name, wanted = f"sensor {part.name}", next((one for one in sensors if one.title == part.name), None)
+    wanted = next((one for one in scenario.sensor if one.title == part.name), None)
     if wanted is None:
         return []
+    name = f"sensor {part.name}"
     return check_device(
         name,
         part.kind,
@@ -283,25 +284,16 @@ def check_sensor(
 ) -> list[Finding]:
     """Return the findings of the readings of `seconds` of a sensor along the needle."""
     readings: list[Reading] = _collect(device, clock, seconds)
-    rate = len(readings) / seconds
-    slow = (
-        f"rate_hz of the scenario is {wanted.rate_hz:g}"
-        if rate < (1.0 - _RATE_TOLERANCE) * wanted.rate_hz
-        else ""
-    )
+    rate, status = len(readings) / seconds, device.status
+    slow = rate < (1.0 - _RATE_TOLERANCE) * wanted.rate_hz
     measured = [one for one in readings if any(isfinite(value) for row in one.rows for value in row)]
-    shown = (
-        [", ".join(f"{value:.4g}" for value in row) for row in measured[-1].rows] if measured else ["none"]
-    )
+    rows = [", ".join(f"{value:.4g}" for value in row) for one in measured[-1:] for row in one.rows]
     few = 2 * len(measured) <= len(readings)
-    reason = readings[-1].status if readings else "no reading"
-    status = device.status
+    reason = f"in less than half of the readings: {readings[-1].status if readings else 'no reading'}"
     return [
-        Finding(name, "readings", f"{rate:.1f} Hz", slow),
-        Finding(name, "status", status, "" if status == VISIBLE else "must be ok while readings arrive"),
-        Finding(
-            name, "values", "; ".join(shown), f"in less than half of the readings: {reason}" if few else ""
-        ),
+        Finding(name, "readings", f"{rate:.1f} Hz", f"rate_hz of the scenario is {wanted.rate_hz:g}" * slow),
+        Finding(name, "status", status, "must be ok while readings arrive" * (status != VISIBLE)),
+        Finding(name, "values", "; ".join(rows) or "none", reason * few),
     ]
 
 

@@ -34,13 +34,8 @@ OFFSET_SDS = 10.0
 """Prior standard deviation of offsets, over the scenario's and over the noise."""
 _LAG_SD = 0.1  # of the tracker's time stamps (s)
 _BIAS_MM = 1.0  # of the tracker
-_STEPS = {
-    "base": 0.05,
-    "slope": 3e-4,
-    "bend": 0.05,
-    "clearance": 0.01,
-    "axial": 0.1,
-}  # for differences, mm and rad
+_STEPS = {"base": 0.05, "slope": 3e-4, "bend": 0.05, "clearance": 0.01, "axial": 0.1}
+"""Steps of differences, mm and rad."""
 _FARTHEST_S, _GRID_S = 0.4, 0.005  # clock errors at which a fit may begin
 _OUTLIER = 5.0  # standard deviations
 _MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
@@ -81,39 +76,26 @@ class AirModel:
         guided, tracked = scenario.setup.has_guide, bool(run.measurements)
         known = scenario.setup.guide_clearance_mm
         clearance = (priors.clearance_mm if known is None else known) if guided else 0.0
+        start = control.start_offset_sd_mm, control.start_angle_sd
         sds = [
-            *np.repeat(
-                [control.start_offset_sd_mm, control.start_angle_sd, priors.bend_sd_mm, priors.run_out_sd_mm],
-                axes,
-            ),
-            priors.clearance_sd_mm * guided,
-            control.start_axial_sd_mm,
-            *[_BIAS_MM] * (1 + axes),
-            _LAG_SD * tracked,
+            *np.repeat([*start, priors.bend_sd_mm, priors.run_out_sd_mm], axes),
+            *(priors.clearance_sd_mm * guided, control.start_axial_sd_mm),
+            *(*[_BIAS_MM] * (1 + axes), _LAG_SD * tracked),
         ]
         sensors = []
         for sensor in (one for one in scenario.sensor if one.title in names):
             sensor_slots, more = wide_priors(sensor, axes, len(sds))
             sds += more
-            size = sensor.size(axes)
-            none = np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
-            sensors.append(SensorFit(sensor, sensor_slots, axes, size, np.zeros(0), *none))
+            size, empty = sensor.size(axes), np.zeros(0)
+            none = empty, np.zeros((0, size)), empty.astype(bool)
+            sensors.append(SensorFit(sensor, sensor_slots, axes, size, empty, *none))
         line = Timeline.of(run.moves, 0.0)
         tips = np.array([(one.time, one.x, one.y, one.z or 0.0) for one in run.measurements]).reshape(-1, 4)
         tips = tips[~rolling(line, tips[:, 0])]
         mean = np.zeros(len(sds))
         mean[slots.clearance] = clearance
-        model = AirModel(
-            simulator,
-            run,
-            line,
-            slots,
-            tuple(sensors),
-            mean,
-            np.maximum(sds, LEAST_SD),
-            tips[:, 0],
-            tips[:, 1 : 2 + axes],
-        )
+        sd, tip = np.maximum(sds, LEAST_SD), tips[:, 1 : 2 + axes]
+        model = AirModel(simulator, run, line, slots, tuple(sensors), mean, sd, tips[:, 0], tip)
         shapes = model.simulate([mean])[1][0]
         return replace(model, sensors=tuple(model._with_readings(one, shapes) for one in sensors))
 
@@ -124,10 +106,8 @@ class AirModel:
         index, *_ = self.line.at(time)
         spacing = self.length / (shapes.shape[1] - 1)
         needles = (Needles(shapes[k + 1][None], spacing) for k in index)
-        values = [
-            read_values(one.sensor, each, needle, one.axes)
-            for each, needle in zip(given, needles, strict=True)
-        ]
+        pairs = zip(given, needles, strict=True)
+        values = [read_values(one.sensor, each, needle, one.axes) for each, needle in pairs]
         value = np.array(values).reshape(-1, one.value.shape[1])
         if one.sensor.rolls and one.axes == 1:  # between half turns it leaves the plane
             value[rolling(self.line, time)] = np.nan
@@ -144,13 +124,10 @@ class AirModel:
         pose = start.base
         states, models = [], []
         for each in parameters:
-            states.append(
-                start.with_estimate(
-                    base_x=float(pose[X] + each[slots.axial]),
-                    base=(pose[Y : Z + 1] + components(each[slots.base])).tolist(),
-                    slope=(pose[3:] + components(each[slots.slope])).tolist(),
-                )
-            )
+            base = (pose[Y : Z + 1] + components(each[slots.base])).tolist()
+            slope = (pose[3:] + components(each[slots.slope])).tolist()
+            base_x = float(pose[X] + each[slots.axial])
+            states.append(start.with_estimate(base_x=base_x, base=base, slope=slope))
             clearance = float(each[slots.clearance]) if self.simulator.scenario.setup.has_guide else None
             models.append(adapt_needle(model, 1.0, from_components(each[slots.bend]), clearance))
         rows = np.array([STILL, *(done.motion.control for done in self.run.moves)])
@@ -208,7 +185,6 @@ class AirFit:
     model: AirModel
     parameters: Floats  # (K,)
     covariance: Floats  # (K, K)
-    tip_residual: Floats  # (r, 1 + a), mm
     predicted: list[Floats]  # by sensor (r, d)
     used: list[Flags]  # by sensor (r, d)
     noise: list[float]  # of each sensor, as seen
@@ -229,11 +205,8 @@ class AirFit:
         """Return the offsets (d,) of a sensor, and their standard deviations, with the error of the model."""
         one = self.model.sensors[number]
         unexplained = one.sensor.model_error(self.predicted[number]).mean(axis=0)
-        places = range(one.slots.offset.start, one.slots.offset.stop)
-        return [
-            (value, math.hypot(sd, more))
-            for (value, sd), more in zip(map(self.mean, places), unexplained, strict=True)
-        ]
+        means = map(self.mean, range(one.slots.offset.start, one.slots.offset.stop))
+        return [(value, math.hypot(sd, more)) for (value, sd), more in zip(means, unexplained, strict=True)]
 
     def predict_without_errors(self) -> list[Floats]:
         """Return the predicted readings (r, d) of error-free sensors on the fitted needle."""
@@ -250,23 +223,21 @@ def fit_in_air(scenario: Scenario, run: AirRun, names: Collection[str] | None = 
     """
     model = AirModel.of(scenario, run, [one.title for one in scenario.sensor] if names is None else names)
     ends = model.quantities(model.simulate([model.mean])[1][0])
-    profiles = [_Profile.of(model, one, each) for one, each in zip(model.sensors, ends, strict=True)]
+    starts = [_find_start(model, one, each) for one, each in zip(model.sensors, ends, strict=True)]
     start = model.mean.copy()
-    for one, profile in zip(model.sensors, profiles, strict=True):
-        start[one.slots.clock] = profile.clock
+    for one, (clock, turn, _) in zip(model.sensors, starts, strict=True):
+        start[one.slots.clock] = clock
         if one.slots.turn is not None:
-            start[one.slots.turn] = profile.turn
+            start[one.slots.turn] = turn
     seen = [np.isfinite(one.value) for one in model.sensors]
-    first = _fit(model, start, seen, [one.sensor.noise for one in model.sensors])
-    residuals = [one.value - each for one, each in zip(model.sensors, first.predicted, strict=True)]
+    first, _, predicted = _fit(model, start, seen, [one.sensor.noise for one in model.sensors])
+    residuals = [one.value - each for one, each in zip(model.sensors, predicted, strict=True)]
     noise = [_scatter(left) or one.sensor.noise for left, one in zip(residuals, model.sensors, strict=True)]
     used = [np.abs(left) < _OUTLIER * sd for left, sd in zip(residuals, noise, strict=True)]
     moves = [model.line.at(one.time)[0] for one in model.sensors]
     each = zip(noise, residuals, used, moves, strict=True)
-    fitted = _fit(
-        model, first.parameters, used, [sd * _excess(left / sd, use, move) for sd, left, use, move in each]
-    )
-    return replace(fitted, noise=noise, profile_sds=[profile.sd for profile in profiles])
+    scaled = [sd * _excess(left / sd, use, move) for sd, left, use, move in each]
+    return AirFit(model, *_fit(model, first, used, scaled), used, noise, [sd for _, _, sd in starts])
 
 
 def _scatter(left: Floats) -> float:
@@ -287,28 +258,22 @@ def _excess(left: Floats, used: Flags, move: NDArray[np.intp]) -> float:
     return max(1.0, float(np.sqrt(squares.mean()))) if squares.size else 1.0
 
 
-@dataclass(frozen=True)
-class _Profile:
-    """Clock errors (s) of a sensor on a grid with the cost of the best other errors, and the best of them."""
+def _find_start(model: AirModel, one: SensorFit, ends: Floats) -> tuple[float, float, float]:
+    """Return the best clock error (s) and turn (rad) of a sensor, and the clock error's sd with all minima of the cost.
 
-    clock: float = 0.0
-    turn: float = 0.0  # rad
-    sd: float = CLOCK_SD  # of the clock error, with all of its minima (s)
-
-    @staticmethod
-    def of(model: AirModel, one: SensorFit, ends: Floats) -> "_Profile":
-        """Return the profile of a sensor; ends: its quantities at the ends of the moves, for the prior's needle."""
-        seen = np.isfinite(one.value).any(axis=1)
-        if not seen.any():
-            return _Profile()
-        known = replace(one, time=one.time[seen], value=one.value[seen])
-        grid = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _GRID_S) + 1)
-        costs, turns = np.transpose([_regress(model, known, ends, clock) for clock in grid])
-        density = np.exp(-0.5 * ((costs - costs.min()) / one.sensor.noise**2 + (grid / CLOCK_SD) ** 2))
-        density /= density.sum()
-        best = int(np.argmin(costs))
-        sd = math.sqrt(density @ (grid - density @ grid) ** 2)
-        return _Profile(float(grid[best]), float(turns[best]), sd)
+    Each clock error on a grid has the best other errors; ends: the sensor's quantities at the ends of the moves, for
+    the prior's needle.
+    """
+    seen = np.isfinite(one.value).any(axis=1)
+    if not seen.any():
+        return 0.0, 0.0, CLOCK_SD
+    known = replace(one, time=one.time[seen], value=one.value[seen])
+    grid = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _GRID_S) + 1)
+    costs, turns = np.transpose([_regress(model, known, ends, clock) for clock in grid])
+    density = np.exp(-0.5 * ((costs - costs.min()) / one.sensor.noise**2 + (grid / CLOCK_SD) ** 2))
+    density /= density.sum()
+    best = int(np.argmin(costs))
+    return float(grid[best]), float(turns[best]), math.sqrt(density @ (grid - density @ grid) ** 2)
 
 
 def _regress(model: AirModel, one: SensorFit, ends: Floats, clock: float) -> tuple[float, float]:
@@ -321,18 +286,18 @@ def _regress(model: AirModel, one: SensorFit, ends: Floats, clock: float) -> tup
         predicted, value = (each[:, ::2] + 1j * each[:, 1::2] for each in (predicted, value))
     known = np.isfinite(value)
     count = np.maximum(known.sum(axis=0), 1)
-    x, y = (
-        np.where(known, each - np.where(known, each, 0.0).sum(axis=0) / count, 0.0)
-        for each in (predicted, value)
-    )
+    means = (np.where(known, each, 0.0).sum(axis=0) / count for each in (predicted, value))
+    x, y = (np.where(known, each - mean, 0.0) for each, mean in zip((predicted, value), means, strict=True))
     power, common = (np.abs(x) ** 2).sum(axis=0), (x.conj() * y).sum(axis=0)
     gain = common / (power + (one.sensor.noise / GAIN_SD) ** 2)
     left = y - gain * x
     return float((np.abs(left) ** 2).sum()), float(np.angle(common.sum())) if pairs else 0.0
 
 
-def _fit(model: AirModel, start: Floats, used: list[Flags], noise: Sequence[float]) -> AirFit:
-    """Return the fit from parameters, to the values of sensors that are used."""
+def _fit(
+    model: AirModel, start: Floats, used: list[Flags], noise: Sequence[float]
+) -> tuple[Floats, Floats, list[Floats]]:
+    """Return parameters, their covariance, and predicted readings of a fit to the values of sensors that are used."""
     jitter = model.simulator.scenario.tracker.jitter_per_axis
 
     def rows(tip: Floats, predicted: Sequence[Floats]) -> Floats:
@@ -365,9 +330,7 @@ def _fit(model: AirModel, start: Floats, used: list[Flags], noise: Sequence[floa
         return np.concatenate([np.stack(columns, axis=1), unit])
 
     found = least_squares(residuals, start, jac=jacobian, method="lm", x_scale=model.sd, xtol=1e-6, ftol=1e-6)
-    tip, predicted = predict(found.x)
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
-    return AirFit(model, found.x, covariance, model.tip - tip, predicted, used, list(noise), [])
+    return found.x, np.linalg.inv(found.jac.T @ found.jac), predict(found.x)[1]
 
 
 def _difference_steps(model: AirModel) -> Floats:

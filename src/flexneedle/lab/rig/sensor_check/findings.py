@@ -1,13 +1,14 @@
 """Findings of a fit in air: each error of a sensor beside the scenario, and the lines that correct the files."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from flexneedle.estimation.along import SensorFit
+from flexneedle.lab.rig.devices.fbg.mounting import MountingSettings
 from flexneedle.lab.rig.preflight.rig_check import Finding, UncheckedFinding
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.sensor_check.air_fit import CLOCK_SD, GAIN_SD, TURN_SD, AirFit
@@ -18,30 +19,7 @@ _SDS = 3.0  # standard deviations by which an error may be off
 _UNKNOWN = 0.5  # share of the prior's standard deviation from which an error is not found
 _LEAST = {"delay": 0.005, "gain": 0.005, "roll offset": 0.004}  # errors that never matter (s, 1, rad)
 _NOISE, _RATE, _LOST = 1.5, 1.1, 0.05  # largest ratios, and largest share
-_CORRECTS = ("fbgs", "interrogator")  # devices with the keys gain and turn_deg
-
-
-@dataclass(frozen=True)
-class Keys:
-    """Keys of a kind for its noise and for the prior of its offset, and their unit, `scale` of which are one inside."""
-
-    noise: str = ""
-    offset: str = ""
-    unit: str = ""
-    scale: float = 1.0
-
-
-_KEYS = {
-    "fbg": Keys("noise_per_m", "bias_per_m", "1/m", 1e3),
-    "slice": Keys("noise_mm", "pose_sd_mm", "mm"),
-    "points": Keys("noise_mm", "place_sd_mm", "mm"),
-    "view": Keys("noise_px", "pose_sd_px", "px"),
-}
-
-
-def keys_of(sensor: Sensor) -> Keys:
-    """Return the keys of the kind of a sensor, without names for a kind that is not included."""
-    return _KEYS.get(sensor.kind, Keys())
+_CORRECTS = ("fbgs", "interrogator")  # devices with `MountingSettings`
 
 
 @dataclass(frozen=True)
@@ -58,9 +36,9 @@ class SensorError:
     sd: float
     unit: str
     allowed: str
-    note: str = ""
-    where: str = ""
-    line: str = ""
+    note: str
+    where: str
+    line: str
 
     @property
     def finding(self) -> Finding:
@@ -70,38 +48,36 @@ class SensorError:
             return UncheckedFinding(part, self.item, f"not found in air: {self.note}")
         sd = f" ± {self.sd:.2g}" if self.sd else ""
         unit = f" {self.unit}" if self.unit else ""
-        found = "; ".join(
-            filter(None, (f"{self.value:.3g}{sd}{unit}", self.note, f"scenario: {self.allowed}"))
-        )
-        return Finding(part, self.item, found, f"{self.line} in the {self.where}" if self.line else "")
+        found = [f"{self.value:.3g}{sd}{unit}", self.note, f"scenario: {self.allowed}"]
+        problem = f"{self.line} in the {self.where}" if self.line else ""
+        return Finding(part, self.item, "; ".join(filter(None, found)), problem)
 
     @property
     def values(self) -> dict[str, Any]:
         """Values of the JSON object."""
-        names = ("sensor", "item", "value", "sd", "unit", "allowed", "note", "where", "line")
-        return {name: getattr(self, name) for name in names}
+        return asdict(self)
 
 
 def find_errors(fit: AirFit, rig: RigFile | None) -> list[SensorError]:
     """Return the errors of all sensors of a fit; rig: of the devices, None for virtual sensors."""
-    return [
-        error for number in range(len(fit.model.sensors)) for error in _SensorCheck(fit, number, rig).errors()
-    ]
+    numbers = range(len(fit.model.sensors))
+    return [error for number in numbers for error in _SensorCheck(fit, number, rig).errors()]
 
 
 class _SensorCheck:
     """Errors of one sensor."""
 
     def __init__(self, fit: AirFit, number: int, rig: RigFile | None) -> None:
-        self._fit, self._number, self._rig = fit, number, rig
+        self._fit, self._number = fit, number
         self._one: SensorFit = fit.model.sensors[number]
         self._sensor: Sensor = self._one.sensor
-        self._keys = keys_of(self._sensor)
         self._readings: Sequence[Reading] = fit.model.run.readings[self._one.name]
-        scenario = fit.model.simulator.scenario
+        parts = () if rig is None else rig.sensor
+        named = (one for one in parts if one.name == self._one.name and one.kind in _CORRECTS)
+        self._device = next(named, None)
         self._by = "the tracker" if fit.model.run.measurements else "the motors"
+        bent = fit.model.simulator.scenario.setup.has_guide or not self._sensor.rolls
         unbent = "nothing bends a needle in air without a guide"
-        bent = scenario.setup.has_guide or not self._sensor.rolls
         self._unfound = "the motions do not show it" if bent else unbent
 
     def errors(self) -> Iterator[SensorError]:
@@ -113,7 +89,7 @@ class _SensorCheck:
         yield self._delay()
         yield self._gain()
         if self._one.slots.turn is not None:
-            yield self._turn()
+            yield self._turn(self._one.slots.turn)
         yield self._offset()
         yield from self._readings_errors()
 
@@ -125,35 +101,33 @@ class _SensorCheck:
         unit: str,
         allowed: str,
         note: str,
-        where: str = "",
         line: str = "",
+        where: str = "scenario",
     ) -> SensorError:
-        return SensorError(self._one.name, item, value, sd, unit, allowed, note, where, line)
+        found = f"{allowed} {unit}".rstrip()
+        return SensorError(self._one.name, item, value, sd, unit, found, note, where if line else "", line)
 
     def _is_off(self, item: str, value: float, sd: float, allowed: float) -> bool:
         return abs(value) > max(_SDS * math.hypot(sd, allowed), _LEAST.get(item, 0.0))
 
     def _delay(self) -> SensorError:
-        value, sd = self._fit.clock(self._number)
-        allowed = f"± {1e3 * self._sensor.delay_sd_s:.3g} ms"
+        (value, sd), allowed = self._fit.clock(self._number), self._sensor.delay_sd_s
+        shown, line = f"± {1e3 * allowed:.3g}", ""
         if sd > _UNKNOWN * CLOCK_SD:
-            return self._error("delay", math.nan, sd, "ms", allowed, self._unfound)
-        right = self._sensor.delay_s + value
-        line = (
-            "" if not self._is_off("delay", value, sd, self._sensor.delay_sd_s) else f"delay_s = {right:.3f}"
-        )
+            return self._error("delay", math.nan, sd, "ms", shown, self._unfound)
         note = f"time stamps {'late' if value > 0.0 else 'early'}, by {self._by}"
-        if line and right < 0.0:  # a device that stamps its readings itself is ahead
-            line, note = f"delay_sd_s = {abs(value):.3f}", f"{note}: the clock of the device is ahead"
-        return self._error(
-            "delay", 1e3 * value, 1e3 * sd, "ms", allowed, note, "scenario" if line else "", line
-        )
+        if self._is_off("delay", value, sd, allowed):
+            right = self._sensor.delay_s + value
+            line = f"delay_s = {right:.3f}"
+            if right < 0.0:  # a device that stamps its readings itself is ahead
+                line, note = f"delay_sd_s = {abs(value):.3f}", f"{note}: the clock of the device is ahead"
+        return self._error("delay", 1e3 * value, 1e3 * sd, "ms", shown, note, line)
 
     def _gain(self) -> SensorError:
         slots, allowed = self._one.slots.gain, self._sensor.gain_sd
         each = [self._fit.mean(k) for k in range(slots.start, slots.stop)]
         known = [k for k, (_, sd) in enumerate(each) if sd < _UNKNOWN * GAIN_SD]
-        shown = f"± {100.0 * allowed:.3g} %"
+        shown = f"± {100.0 * allowed:.3g}"
         if not known:
             return self._error("gain", math.nan, 0.0, "%", shown, self._unfound)
         mean, sd = self._fit.mean(slots)
@@ -161,72 +135,58 @@ class _SensorCheck:
         note = f"mean of {len(each)}, {len(known)} found, by the model and {self._by}"
         if len(each) > 1:
             note += f"; number {worst + 1}: {100.0 * each[worst][0]:.2g} ± {100.0 * each[worst][1]:.2g}"
-        line = where = ""
+        line, where = "", "scenario"
         if self._is_off("gain", *each[worst], allowed):
-            where, line = self._correct("gain", lambda now: now / (1.0 + mean), 1.0) or (
-                "scenario",
-                f"gain_sd = {abs(each[worst][0]):.2g}",
-            )
-        return self._error("gain", 100.0 * mean, 100.0 * sd, "%", shown, note, where, line)
+            prior = f"gain_sd = {abs(each[worst][0]):.2g}"
+            line, where = self._correct("gain", lambda now: now / (1.0 + mean), prior)
+        return self._error("gain", 100.0 * mean, 100.0 * sd, "%", shown, note, line, where)
 
-    def _turn(self) -> SensorError:
-        value, sd = self._fit.mean(self._one.slots.turn or 0)
+    def _turn(self, place: int) -> SensorError:
+        value, sd = self._fit.mean(place)
         value = math.remainder(value, 2.0 * math.pi)
-        degrees, allowed = math.degrees(value), self._sensor.turn_sd_deg
-        shown = f"± {allowed:g} deg"
+        degrees, sd_deg, allowed = math.degrees(value), math.degrees(sd), self._sensor.turn_sd_deg
         if sd > _UNKNOWN * TURN_SD:
-            return self._error("roll offset", math.nan, math.degrees(sd), "deg", shown, self._unfound)
-        line = where = ""
+            return self._error("roll offset", math.nan, sd_deg, "deg", f"± {allowed:g}", self._unfound)
+        line, where = "", "scenario"
         if self._is_off("roll offset", value, sd, math.radians(allowed)):
-            where, line = self._correct("turn_deg", lambda now: now - degrees, 0.0) or (
-                "scenario",
-                f"turn_sd_deg = {min(abs(degrees), 90.0):.2g}",
-            )
+            prior = f"turn_sd_deg = {min(abs(degrees), 90.0):.2g}"
+            line, where = self._correct("turn_deg", lambda now: now - degrees, prior)
         note = f"by the model and {self._by}"
-        return self._error("roll offset", degrees, math.degrees(sd), "deg", shown, note, where, line)
+        return self._error("roll offset", degrees, sd_deg, "deg", f"± {allowed:g}", note, line, where)
 
-    def _correct(self, key: str, corrected: Any, default: float) -> tuple[str, str] | None:
-        """Return rig file and line that correct a key of the sensor's device, None for a device without it."""
-        parts = () if self._rig is None else self._rig.sensor
-        part = next((one for one in parts if one.name == self._one.name and one.kind in _CORRECTS), None)
-        if part is None:
-            return None
-        return "rig file", f"{key} = {corrected(float(part.settings.get(key, default))):.4g}"
+    def _correct(self, key: str, corrected: Callable[[float], float], prior: str) -> tuple[str, str]:
+        """Return the line that corrects a key of the device, and its file; without the key the prior's line."""
+        if self._device is None:
+            return prior, "scenario"
+        now = self._device.settings.get(key, MountingSettings.model_fields[key].default)
+        return f"{key} = {corrected(float(now)):.4g}", "rig file"
 
     def _offset(self) -> SensorError:
-        keys, each, allowed = self._keys, self._fit.offset(self._number), self._sensor.offset_sd
+        keys, each, allowed = self._sensor.keys, self._fit.offset(self._number), self._sensor.offset_sd
         value, sd = max(each, key=lambda one: abs(one[0]) / math.hypot(one[1], allowed or 1.0))
-        line = ""
-        if self._is_off("offset", value, sd, allowed) and keys.offset:
-            line = f"{keys.offset} = {keys.scale * abs(value):.2g}"
+        is_off = self._is_off("offset", value, sd, allowed) and keys.offset
+        line = f"{keys.offset} = {abs(value) / keys.size:.2g}" if is_off else ""
         note = f"largest of {len(each)}" + (", with the natural bend" if self._sensor.rolls else "")
-        shown = f"± {keys.scale * allowed:.3g} {keys.unit}".rstrip()
-        where = "scenario" if line else ""
-        return self._error("offset", keys.scale * value, keys.scale * sd, keys.unit, shown, note, where, line)
+        shown = f"± {allowed / keys.size:.3g}"
+        return self._error("offset", value / keys.size, sd / keys.size, keys.unit, shown, note, line)
 
     def _readings_errors(self) -> Iterator[SensorError]:
         """Yield noise, rate, and lost and outlying readings."""
-        sensor, keys = self._sensor, self._keys
-        noise, times = self._fit.noise[self._number], [one.time for one in self._readings]
-        off = not 1.0 / _NOISE < noise / sensor.noise < _NOISE
-        line = f"{keys.noise} = {keys.scale * noise:.2g}" if off and keys.noise else ""
-        shown = f"{keys.scale * sensor.noise:.3g} {keys.unit}".rstrip()
-        yield self._error(
-            "noise", keys.scale * noise, 0.0, keys.unit, shown, "", "scenario" if line else "", line
-        )
+        sensor, keys, number = self._sensor, self._sensor.keys, self._number
+        noise, expected = self._fit.noise[number] / keys.size, sensor.noise / keys.size
+        fits = 1.0 / _NOISE < noise / expected < _NOISE or not keys.noise
+        line = "" if fits else f"{keys.noise} = {noise:.2g}"
+        yield self._error("noise", noise, 0.0, keys.unit, f"{expected:.3g}", "", line)
+        times = [one.time for one in self._readings]
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         line = "" if 1.0 / _RATE < rate / sensor.rate_hz < _RATE else f"rate_hz = {rate:.3g}"
-        yield self._error(
-            "rate", rate, 0.0, "Hz", f"{sensor.rate_hz:g} Hz", "", "scenario" if line else "", line
-        )
+        yield self._error("rate", rate, 0.0, "Hz", f"{sensor.rate_hz:g}", "", line)
         lost = float(np.mean([one.status != VISIBLE for one in self._readings]))
-        expected = sensor.phantom.missing_fraction
-        line = f"phantom.missing_fraction = {lost:.2g}" if lost > max(_LOST, 2.0 * expected) else ""
-        finite = np.isfinite(self._one.value)
-        outlying = 1.0 - self._fit.used[self._number].sum() / finite.sum()
+        share = sensor.phantom.missing_fraction
+        line = f"phantom.missing_fraction = {lost:.2g}" if lost > max(_LOST, 2.0 * share) else ""
+        outlying = 1.0 - self._fit.used[number].sum() / np.isfinite(self._one.value).sum()
         note = f"{100.0 * outlying:.2g} % of the values are outliers"
-        shown = f"{100.0 * expected:.3g} %"
-        yield self._error("lost", 100.0 * lost, 0.0, "%", shown, note, "scenario" if line else "", line)
+        yield self._error("lost", 100.0 * lost, 0.0, "%", f"{100.0 * share:.3g}", note, line)
 
 
 def lines_to_paste(errors: Sequence[SensorError]) -> list[str]:

@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 
 from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, apply_style, new_figure
 from flexneedle.lab.rig.sensor_check.air_fit import AirFit
-from flexneedle.lab.rig.sensor_check.findings import keys_of
 from flexneedle.types import Floats
 
 _ROW = 2.1  # height of a row (inches)
@@ -31,10 +30,10 @@ def _draw_sensor(whole: Axes, part: Axes, fit: AirFit, number: int, before: Floa
     """Draw the value with the largest scatter of its prediction; the part is where that changes fastest."""
     one, after, used = fit.model.sensors[number], fit.predicted[number], fit.used[number]
     column = int(np.argmax(np.where(used.any(axis=0), after.std(axis=0), -1.0)))
-    keys = keys_of(one.sensor)
+    keys = one.sensor.keys
     kept, time = used[:, column], one.time
     value, *predicted = (
-        np.where(kept, keys.scale * rows[:, column], np.nan) for rows in (one.value, before, after)
+        np.where(kept, rows[:, column] / keys.size, np.nan) for rows in (one.value, before, after)
     )
     for panel in (whole, part):
         panel.plot(time, value, ".", color=MEASURED, markersize=2, alpha=0.5, label="measured")

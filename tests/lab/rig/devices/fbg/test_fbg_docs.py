@@ -28,7 +28,7 @@ def test_its_rig_files_are_valid(index, model):
     block = re.findall(r"```toml.*?\n(.*?)```", PAGE, re.DOTALL)[index]
     (settings,) = tomllib.loads(block)["sensor"]
     del settings["name"], settings["kind"]
-    check_settings(model, settings)
+    assert check_settings(model, settings).model_fields_set == set(settings)
 
 
 def test_its_commands_are_valid():

@@ -2,7 +2,6 @@
 
 import math
 import socket
-import time
 from contextlib import ExitStack
 from itertools import pairwise
 from threading import Event, Thread
@@ -11,6 +10,7 @@ from time import monotonic
 import numpy as np
 import pytest
 
+from emulated import until
 from flexneedle.errors import DriverError, RigError
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.fbgs import FAULTS, POSITIONS_MM, FbgsServer, FbgsSession, advance, encode_frame
@@ -55,11 +55,10 @@ def test_a_site_at_a_grating_has_its_curvature_and_another_the_mean_by_distance(
     np.testing.assert_allclose(found, [[0.001, 0.0], between, [0.004, 0.0]], atol=1e-12)
 
 
-def test_turn_mirror_offsets_and_gain_change_the_curvature_in_their_order():
-    """κ e^(i(±α + offset + turn)) · gain."""
-    offsets = [10.0, 20.0, 30.0, 40.0]
-    found = rows((20.0,), [0.001] * 4, [0.3] * 4, turn_deg=15.0, mirrored=True, offsets_deg=offsets, gain=1.1)
-    angle = -0.3 + math.radians(30.0 + 15.0)
+def test_turn_mirror_and_gain_change_the_curvature_in_their_order():
+    """κ e^(i(±α + turn)) · gain."""
+    found = rows((20.0,), [0.001] * 4, [0.3] * 4, turn_deg=45.0, mirrored=True, gain=1.1)
+    angle = -0.3 + math.radians(45.0)
     np.testing.assert_allclose(found[0], [0.0011 * math.cos(angle), 0.0011 * math.sin(angle)], rtol=1e-9)
 
 
@@ -71,10 +70,9 @@ def test_a_grating_without_value_leaves_the_sites_between_others():
 @pytest.mark.parametrize(
     ("values", "line"),
     [
-        ({"positions_mm": [40, 30, 30]}, r"positions_mm = \[40, 30, 30\]: must rise or fall"),
-        ({"positions_mm": [90, 30]}, r"sites_mm = 20.0: must be between 30 and 90"),
-        ({"offsets_deg": [1.0]}, r"offsets_deg = \[1.0\]: must have an entry for each grating, 18"),
-        ({"hosts": "a"}, r'hosts = "a": unknown key; did you mean host\?'),
+        ({"positions_mm": [40, 30, 30]}, r"positions_mm = \[40, 30, 30\]: "),
+        ({"positions_mm": [90, 30]}, r"sites_mm = 20.0: "),
+        ({"hosts": "a"}, r'hosts = "a": '),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(values, line):
@@ -147,15 +145,6 @@ class EmulatedDevice:
         return FbgsSensor(settings(port=self._tcp.address[1], **values), clock or WallClock(), SENSOR)
 
 
-def until(condition, seconds=10.0):
-    """Poll a condition of a device in real time."""
-    end = monotonic() + seconds
-    while not (found := condition()):
-        assert monotonic() < end
-        time.sleep(0.005)
-    return found
-
-
 @pytest.fixture
 def connected(monkeypatch):
     """A device and a sensor of it that connects again at once."""
@@ -204,10 +193,11 @@ def test_values_that_are_not_valid_are_not_read(connected, fault, status):
     assert readings[-1].status == status
 
 
-def lines_of(client, count):
-    """Return the numbers of the next frames of a connection."""
+def lines_of(client, count, flush=lambda: None):
+    """Return the numbers of the next frames of a connection; flush: called before more is received."""
     decoder, found = FrameDecoder(), []
     while len(found) < count:
+        flush()
         found += [one.line for one in decoder.feed(client.recv(1 << 16))]
     assert decoder.refused == decoder.skipped == ""
     return found
@@ -221,11 +211,8 @@ def test_four_clients_get_every_frame_and_one_that_does_not_read_loses_whole_one
         for line in range(1, 601):  # 9 MB: more than the buffers of a connection have
             server.send(encode_frame(line, 0.0, np.zeros((2, 18))))
             assert [lines_of(one, 1) for one in clients[:4]] == [[line]] * 4
-        last = Thread(target=lambda: [server.send(b"") or time.sleep(0.002) for _ in range(100)])
-        last.start()
-        found = lines_of(clients[4], 50)
+        found = lines_of(clients[4], 50, lambda: server.send(b""))
         assert all(later > earlier for earlier, later in pairwise(found))
-        last.join()
 
 
 class TestFbgs(NeedleSensorConformance):

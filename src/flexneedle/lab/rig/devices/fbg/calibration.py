@@ -109,10 +109,8 @@ def _make_calibration(file: _CalibrationFile) -> NeedleCalibration:
         _refuse(_LOCATIONS, outside[0], f"must be from 0 to below length ({file.length:g}), from the base")
     if file.central is not None and file.central > file.channels:
         _refuse("Central Core CH", file.central, f"must be at most # channels ({file.channels})")
-    matrices, weights = (
-        _by_site(_MATRICES, file.matrices, locations),
-        _by_site(_WEIGHTS, file.weights, locations),
-    )
+    matrices = _by_site(_MATRICES, file.matrices, locations)
+    weights = _by_site(_WEIGHTS, file.weights, locations)
     used = tuple(n for n in range(len(locations)) if weights.get(n, 1.0) > 0.0)
     if len(used) < 2:
         _refuse(_WEIGHTS, None, "at least 2 sites must have a weight above 0")
@@ -120,14 +118,9 @@ def _make_calibration(file: _CalibrationFile) -> NeedleCalibration:
         if [len(row) for row in matrices.get(n, [])] != [file.channels] * 2:
             rule = f"must have 2 rows of {file.channels} numbers (# channels) for each site with a weight"
             _refuse(_MATRICES, locations[n], rule)
-    return NeedleCalibration(
-        file.serial,
-        tuple(file.length - locations[n] for n in used),
-        used,
-        len(locations),
-        np.array([matrices[n] for n in used]),
-        None if file.central is None else file.central - 1,
-    )
+    positions, chosen = tuple(file.length - locations[n] for n in used), np.array([matrices[n] for n in used])
+    central = None if file.central is None else file.central - 1
+    return NeedleCalibration(file.serial, positions, used, len(locations), chosen, central)
 
 
 def _by_site(key: str, given: Mapping[str, Value], locations: list[float]) -> dict[int, Value]:
@@ -137,9 +130,8 @@ def _by_site(key: str, given: Mapping[str, Value], locations: list[float]) -> di
         place = _number(text)
         at = [n for n, location in enumerate(locations) if abs(location - place) <= _SAME_MM]
         if not at:
-            _refuse(
-                key, text, f"must be one of Sensor Locations, {', '.join(f'{one:g}' for one in locations)}"
-            )
+            known = ", ".join(f"{one:g}" for one in locations)
+            _refuse(key, text, f"must be one of Sensor Locations, {known}")
         found[at[0]] = value
     return found
 

@@ -5,6 +5,7 @@ manufacturer. No manufacturer's protocol is included.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Protocol
 
 import numpy as np
@@ -60,41 +61,37 @@ class WavelengthSource(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
 class Interrogator:
     """The port `NeedleSensor` of wavelengths.
 
     reference: wavelengths (signals,) of the straight needle, nm; delay: age of a sample on arrival (s).
     """
 
-    def __init__(
-        self,
-        source: WavelengthSource,
-        calibration: NeedleCalibration,
-        sites: SiteMap,
-        reference: Floats,
-        delay: float,
-    ) -> None:
-        self._source, self._calibration, self._map = source, calibration, sites
-        self._reference, self._delay = reference, delay
+    source: WavelengthSource
+    calibration: NeedleCalibration
+    sites: SiteMap
+    reference: Floats
+    delay: float
 
     def read(self) -> tuple[Reading, ...]:
         """Return the readings since the last call, oldest first; may be empty."""
-        return tuple(self._make_reading(time, values) for time, values in self._source.read())
+        return tuple(self._make_reading(time, values) for time, values in self.source.read())
 
     @property
     def status(self) -> str:
         """VISIBLE while readings arrive, otherwise the reason in a few words."""
-        return self._source.status
+        return self.source.status
 
     def close(self) -> None:
         """Disconnect."""
-        self._source.close()
+        self.source.close()
 
     def _make_reading(self, time: float, values: Sequence[float]) -> Reading:
-        taken = time - self._delay
-        if problem := _count_problem(values, self._calibration):
+        taken = time - self.delay
+        if problem := _count_problem(values, self.calibration):
             return Reading(taken, (), problem)
-        rows = self._map.to_rows(self._calibration.to_bends(np.asarray(values) - self._reference))
+        rows = self.sites.to_rows(self.calibration.to_bends(np.asarray(values) - self.reference))
         return Reading(taken, rows, VISIBLE if rows else "no value is valid")
 
 
@@ -135,10 +132,11 @@ def _average(
 
 def _count_problem(values: Sequence[float], calibration: NeedleCalibration) -> str:
     """Return the problem of the number of wavelengths, or ""."""
-    if np.shape(values) == (calibration.signals,):
-        return ""
+    have, want = len(values), calibration.signals
     return (
-        f"{len(values)} wavelengths, expected {calibration.signals}: channels times sites of the calibration"
+        ""
+        if have == want
+        else f"{have} wavelengths, expected {want}: channels times sites of the calibration"
     )
 
 

@@ -25,8 +25,6 @@ class MountingSettings(Section):
     """Angle to add to the directions of bending so that they count from y towards z."""
     mirrored: bool = False
     """True: the directions of the device count the other way, from z towards y."""
-    offsets_deg: Annotated[tuple[float, ...], Field(strict=False, max_length=1000)] = ()
-    """Angle of each grating, to be added like `turn_deg`, in the order of the device. Not set: 0."""
     gain: Positive = 1.0
     """Factor of the curvatures."""
 
@@ -67,7 +65,7 @@ class SiteMap:
         gratings: Number of gratings.
 
     Raises:
-        RigError: A site is not between the first and the last grating, or there are too few or too many offsets.
+        RigError: A site is not between the first and the last grating.
     """
 
     def __init__(
@@ -79,19 +77,15 @@ class SiteMap:
         rule = f"must be between {ascending[0]:g} and {ascending[-1]:g}, the outer gratings of the device"
         if outside := [site for site in sites if not ascending[0] <= site <= ascending[-1]]:
             raise RigError(*(to_line(Problem("sites_mm", site, rule)) for site in outside))
-        offsets = mounting.offsets_deg or (0.0,) * len(positions)
-        if len(offsets) != len(positions):
-            rule = f"must have an entry for each grating, {len(positions)}"
-            raise RigError(to_line(Problem("offsets_deg", offsets, rule)))
         left = np.minimum(np.searchsorted(ascending, wanted, side="right") - 1, len(ascending) - 2)
         self._share = (wanted - ascending[left]) / (ascending[left + 1] - ascending[left])
         self._near, self._far = order[left], order[left + 1]
         self._mirrored = mounting.mirrored
-        self._factors = mounting.gain * np.exp(1j * np.radians(mounting.turn_deg + np.array(offsets)))
+        self._factor = mounting.gain * np.exp(1j * np.radians(mounting.turn_deg))
 
     def to_rows(self, bends: Bends) -> Matrix:
         """Return κy, κz (1/mm) of each site, NaN where a grating beside it has no value; no rows without any value."""
-        turned = (bends.conj() if self._mirrored else bends) * self._factors
+        turned = (bends.conj() if self._mirrored else bends) * self._factor
         near, far = turned[self._near], turned[self._far]
         # A grating whose share is 0 may lack its value.
         mixed = np.where(self._share == 0.0, near, (1.0 - self._share) * near + self._share * far)

@@ -124,9 +124,7 @@ def decode_payload(payload: bytes) -> FibreFrame:
     if len(curvature) != len(angle):
         raise FrameError(f"{len(curvature)} curvatures and {len(angle)} angles")
     error, line, stamp = (
-        _number(fields, ERROR, "<H"),
-        _number(fields, LINE, "<Q"),
-        _number(fields, STAMP, "<d"),
+        _number(fields, kind, form) for kind, form in zip((ERROR, LINE, STAMP), "HQd", strict=True)
     )
     return FibreFrame(payload[0], int(error or 0), line, stamp, curvature, angle)
 
@@ -148,13 +146,13 @@ def _split_fields(payload: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _number(fields: dict[int, bytes], kind: int, form: str) -> Any:
-    """Return the number in a field, None without the field."""
+    """Return the number in a field, None without the field; form: of `struct`."""
     content = fields.get(kind)
     if content is None:
         return None
-    if len(content) != struct.calcsize(form):
-        raise FrameError(f"field {kind} has {len(content)} bytes, expected {struct.calcsize(form)}")
-    return struct.unpack(form, content)[0]
+    if len(content) != struct.calcsize(f"<{form}"):
+        raise FrameError(f"field {kind} has {len(content)} bytes, expected {struct.calcsize(f'<{form}')}")
+    return struct.unpack(f"<{form}", content)[0]
 
 
 def _array(fields: dict[int, bytes], kind: int) -> Floats:
