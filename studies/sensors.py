@@ -284,6 +284,7 @@ def main() -> None:
         for row in ROWS
         if row.name in chosen.rows and (guided or not row.guided_only)
     ]
+    cases.sort(key=lambda case: (case[0], case[1]))  # what is done at an interrupt has all rows
     chosen.out.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
     with ProcessPoolExecutor(chosen.workers) as pool, (chosen.out / "rows.jsonl").open("w") as file:

@@ -95,7 +95,7 @@ def _compute_all(
     single: bool,
 ) -> dict[str, Fault]:
     """Return the likeliest faults, of single values or of all together; of residuals (n,) with this covariance."""
-    precision: Floats = np.linalg.inv(covariance)
+    precision = np.linalg.inv(covariance).astype(np.float64)
     weighted, depth = precision @ left, float(fitted.tips[-1, X])
     found = {}
     for name, one in rows.items():
@@ -104,7 +104,7 @@ def _compute_all(
         found[name] = _find_fault(one.depth, value, weighted[own], precision[own, own], size, depth)
         others = [other.depth.max() for key, other in rows.items() if key != name]
         if name == TRACKER or max(others, default=-np.inf) < depth - _BESIDE_MM:
-            alone: Floats = np.linalg.inv(covariance[own, own])
+            alone = np.linalg.inv(covariance[own, own]).astype(np.float64)
             by_itself = _find_fault(one.depth, value, alone @ left[own], alone, size, depth)
             found[name] = found[name]._replace(log_odds=found[name].log_odds - max(0.0, by_itself.log_odds))
     return found
