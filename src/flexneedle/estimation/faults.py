@@ -8,8 +8,8 @@ the generalised likelihood ratio for a change of unknown time (Willsky and Jones
 After a leap of the needle the model is late. So the tracker's own evidence against the model is no evidence of its
 fault and is subtracted, as is the evidence of a sensor beside which no other measures.
 
-The model's error lasts over some moves, and is correlated as e^(−moves/length). Readings are averaged over so many
-moves, the last ones over few.
+The model's error lasts over some moves, and is correlated as e^(−moves/length). Readings are averaged over this
+number of moves, the last ones over fewer.
 """
 
 import itertools

@@ -19,7 +19,7 @@ _SDS = 3.0  # standard deviations by which an error may be off
 _UNKNOWN = 0.5  # share of the prior's standard deviation from which an error is not found
 _LEAST = {"delay": 0.005, "gain": 0.005, "roll offset": 0.004}  # errors that never matter (s, 1, rad)
 _NOISE, _RATE, _LOST = 1.5, 1.1, 0.05  # largest ratios, and largest share
-_CORRECTS = ("fbgs", "interrogator")  # devices with `MountingSettings`
+_CORRECTS = ("fbgs", "interrogator", "ros")  # devices with `MountingSettings`
 
 
 @dataclass(frozen=True)
