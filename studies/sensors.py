@@ -78,6 +78,11 @@ def one_fibre(scenario: Any, rng: np.random.Generator) -> list[dict[str, Any]]:
     return [fbg(scenario, rng)]
 
 
+def fibre_and_slices(scenario: Any, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Return a healthy fibre and two image planes."""
+    return [fbg(scenario, rng), *slices(scenario, rng)]
+
+
 def faulty(
     sensor: dict[str, Any], scenario: Any, rng: np.random.Generator, kind: str, size: float
 ) -> dict[str, Any]:
@@ -111,6 +116,7 @@ ROWS = (
     Row("em", no_sensor),
     Row("em + fbg", one_fibre),
     Row("em + slices", slices),
+    Row("em + fbg + slices", fibre_and_slices),
     Row("bias", no_sensor, lambda _: BIASED),
     Row("bias, fbg", one_fibre, lambda _: BIASED),
     Row("bias, slices", slices, lambda _: BIASED),

@@ -22,7 +22,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_FAULTY = 9.0  # ln of the Bayes factor, from which there is a fault
+_FAULTY = 9.0  # log odds (natural) of a fault, from which there is one
 _CLEAR = 3.0  # by which a fault must be likelier than another
 
 
@@ -138,11 +138,9 @@ def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
     tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
     name = max(odds, key=lambda name: odds[name], default="")
     if most > _FAULTY and most - tip > _CLEAR:
-        return name, Verdict(
-            VerdictKind.CONTRADICTED, f"ln of the odds of a fault is {most:.1f}, limit {_FAULTY:g}"
-        )
+        return name, Verdict(VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:g}")
     if tip > _FAULTY:
-        reason = f"{TRACKER}: ln of the odds of a fault is {tip:.1f}, limit {_FAULTY:g}"
+        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {_FAULTY:g}"
         if tip - most > _CLEAR:
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
         return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
