@@ -191,9 +191,7 @@ def _all_rows(fitted: FittedInsertion) -> Iterator[tuple[str, _Rows]]:
     for k, one in enumerate(fitted.along):
         bins = fitted.bins[k]
         depth = fitted.depths(bins)
-        slopes = fitted.along_slopes(depth, k)
-        ends, line = fitted.quantities[k], fitted.timeline
-        jacobian = one.jacobian(bins, ends, depth, slopes, fitted.parameters, line)
+        jacobian = fitted.along_jacobians[k]
         noise = one.sensor.noise**2 / np.where(bins.count > 0.0, bins.count, np.nan)
         yield (
             one.name,

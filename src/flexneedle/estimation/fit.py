@@ -12,6 +12,7 @@ import numpy as np
 
 from flexneedle.estimation.along import Bins, SensorFit, whiten
 from flexneedle.estimation.fitted import (
+    LASTING,
     Fitted,
     FittedInsertion,
     Perturbed,
@@ -162,14 +163,27 @@ def inform_along(fitted: FittedInsertion, gradient: Floats, precision: Floats) -
     """Return the downhill gradient (K,) and the precision (K, K) with the readings of sensors along the needle."""
     gradient, precision = gradient.copy(), precision.copy()
     for k, one in enumerate(fitted.along):
-        bins, ends = fitted.bins[k], fitted.quantities[k]
-        depth = fitted.depths(bins)
-        slopes = fitted.along_slopes(depth, k)
-        jacobian = one.jacobian(bins, ends, depth, slopes, fitted.parameters, fitted.timeline)
-        for left, rows in _whitened(one, bins, fitted.along_residuals[k], jacobian):
+        both = fitted.along_residuals[k], fitted.along_jacobians[k]
+        for left, rows in _whitened(one, fitted.bins[k], *both):
             gradient += rows.T @ left
             precision += rows.T @ rows
     return gradient, precision
+
+
+def lasting_covariance(fitted: FittedInsertion, gains: Floats) -> Floats:
+    """Return the covariance (n, n) of n functions of the parameters by the errors of the model that last.
+
+    The fit takes the errors of the model in the readings of sensors along the needle for white, but they last from move
+    to move. gains: the functions' derivatives times the covariance of the parameters (n, K).
+    """
+    found = np.zeros((len(gains), len(gains)))
+    for one, bins, jacobian in zip(fitted.along, fitted.bins, fitted.along_jacobians, strict=True):
+        weights = one.sensor.model_error(bins.value) / one.variances(bins)
+        errors = weights * (jacobian @ gains.T).transpose(2, 0, 1)
+        apart = np.abs(bins.index[:, None] - bins.index)
+        lasting = np.where(apart > 0, np.exp(-apart / LASTING), 0.0)
+        found += np.einsum("nid,ij,mjd->nm", errors, lasting, errors, optimize=True)
+    return found
 
 
 def cost_along(fitted: FittedInsertion) -> float:

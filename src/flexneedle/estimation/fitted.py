@@ -172,6 +172,22 @@ class FittedInsertion:
             for one, bins, ends in parts
         ]
 
+    @cached_property
+    def along_jacobians(self) -> list[Floats]:
+        """Derivatives (b, d, K) of the values of the sensors along the needle to the parameters."""
+        parts = enumerate(zip(self.along, self.bins, self.quantities, strict=True))
+        return [
+            one.jacobian(
+                bins,
+                ends,
+                self.depths(bins),
+                self.along_slopes(self.depths(bins), k),
+                self.parameters,
+                self.timeline,
+            )
+            for k, (one, bins, ends) in parts
+        ]
+
     def depths(self, bins: Bins) -> Floats:
         """Return the depths (b,), mm, of the tip at means of readings."""
         return between(bins, self.tips[:, X, None])[:, 0]

@@ -41,6 +41,7 @@ from flexneedle.estimation.fit import (
     cost_of,
     differentiate,
     improve_fit,
+    lasting_covariance,
     simulate_due,
     variance_of_rows,
 )
@@ -197,7 +198,8 @@ class Identified(FittedInsertion):
         readings = extended.readings[0]
         fitted = improve_fit(extended)
         if not measurements or not len(readings.index):
-            return fitted.without_reading()
+            # Only sensors along the needle measured: the model's error at the tip is less and less known.
+            return fitted.change(residual=math.exp(-1.0 / LASTING) * fitted.residual).without_reading()
         left, lead = fitted.residuals[0], fitted.lead
         ahead = readings.ahead(fitted.tips[:, X]) - lead[readings.index] - fitted.axial_bias
         newest = int(readings.index[-1]) + 1
@@ -263,24 +265,25 @@ class Identified(FittedInsertion):
         """Return the derivatives of the tip's x to the axial errors, of its reading with `bias` = 1."""
         return [1.0, float(self.state.travel[DB_X]), 1.0, bias][: len(self.axial_covariance)]
 
-    @property
+    @cached_property
     def tip_covariance(self) -> Floats:
-        """Covariance (3, 3) of the tip's x, y, z (mm²), with the model's error at the tip."""
+        """Covariance (3, 3) of the tip's x, y, z (mm²), with the errors of the model that last."""
         slope = self._tip_slope
         parts = np.stack([slope.real, slope.imag])
         covariance = np.zeros((3, 3))
         covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
         model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
         left = model**2 * (1.0 - math.exp(-2.0 * self._age_of_residual / LASTING))
-        covariance[1:, 1:] = parts @ self.covariance @ parts.T + left * np.diag([1.0, self.axes - 1.0])
+        gains = parts @ self.covariance
+        covariance[1:, 1:] = gains @ parts.T + lasting_covariance(self, gains)
+        covariance[1:, 1:] += left * np.diag([1.0, self.axes - 1.0])
         return covariance
 
     @property
     def _age_of_residual(self) -> float:
-        """Moves to which the low-passed residual refers, back from now: the rest of the model's error is unknown."""
+        """Moves since the low-passed residual was known: what has changed since then is the model's error."""
         read = [k for k, done in enumerate(self.moves) if done.measurements]
-        lag = 1.0 / max(self.settings.residual_gain, LEAST_SD)
-        return len(self.moves) - 1 - read[-1] + lag if read else math.inf
+        return float(len(self.moves) - read[-1]) if read else math.inf
 
     @property
     def bias(self) -> Point:

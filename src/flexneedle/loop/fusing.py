@@ -22,7 +22,8 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_FAULTY = 9.0  # log odds (natural) of a fault, from which there is one
+_FAULTY = 9.0  # log odds (natural) of a fault of a sensor, from which it is excluded
+_IN_DOUBT = 4.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
 _CLEAR = 3.0  # by which a fault must be likelier than another
 
 
@@ -139,8 +140,8 @@ def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
     name = max(odds, key=lambda name: odds[name], default="")
     if most > _FAULTY and most - tip > _CLEAR:
         return name, Verdict(VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:g}")
-    if tip > _FAULTY:
-        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {_FAULTY:g}"
+    if tip > _IN_DOUBT and most - tip < _CLEAR:
+        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {_IN_DOUBT:g}"
         if tip - most > _CLEAR:
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
         return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
