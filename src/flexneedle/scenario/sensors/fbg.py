@@ -97,10 +97,14 @@ class Fbg(KeyedSensor):
         return change[:, :, None] * np.repeat(np.eye(len(self.sites_mm)), axes, axis=0)
 
     def model_error(self, values: "Floats") -> "Floats":
-        """Return standard deviations (r, d), 1/mm: a constant, and a share of the curvature of the site."""
+        """Return standard deviations (r, d), 1/mm: a constant, and a share of the curvature of the site.
+
+        Where a site is straight for a while the model errs as elsewhere: so the rms of its readings counts, or more.
+        """
         count = len(self.sites_mm)
         sites = values.reshape(len(values), count, values.shape[1] // count)
         size = np.sqrt((sites**2).sum(axis=2, keepdims=True))
+        size = np.maximum(size, np.sqrt((size**2).sum(axis=0) / max(1, len(size))))
         found = np.hypot(_PER_M * _MODEL_PER_M, _MODEL_SHARE * size)
         return np.broadcast_to(found, sites.shape).reshape(values.shape)
 
