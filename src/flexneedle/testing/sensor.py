@@ -175,7 +175,8 @@ class SensorConformance:
             for one in state.readings
             if one.verdict.kind is not VerdictKind.MISSING
         ]
-        require(verdicts, "the sensor measured nothing in the insertion: check `sees`, `report` and `read`")
+        hint = "check `sees`, `report` and `read`, or set `scenario` to a deeper insertion"
+        require(verdicts, f"the sensor measured nothing in the insertion: {hint}")
         bad = [str(verdict) for verdict in verdicts if not verdict.ok]
         require(
             len(bad) <= _REJECTED * len(verdicts),
