@@ -32,6 +32,7 @@ class Fbg(Sensor):
     """One `[[sensor]]` with `kind = "fbg"`."""
 
     paired, rolls = True, True
+    unit = 1e3, "1/m"
 
     kind: Literal["fbg"]
     sites_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=1000)]

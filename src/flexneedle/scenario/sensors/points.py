@@ -49,6 +49,7 @@ class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
 
     paired = True
+    unit = 1.0, "mm"
 
     kind: Literal["points"]
     rate_hz: Positive = 2.0

@@ -69,6 +69,8 @@ class Sensor(Section):
     """True: values are lateral quantities: y in the plane, in space y and z, one after the other, as a vector."""
     rolls: ClassVar[bool] = False
     """True: the sensor is in the needle and rolls with it. Its values are `paired`."""
+    unit: ClassVar[tuple[float, str]] = 1.0, ""
+    """Factor and unit with which values are shown."""
 
     kind: str
     """`fbg`, `slice`, `points`, `view` or `module:NAME`."""

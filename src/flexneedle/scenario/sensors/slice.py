@@ -34,6 +34,7 @@ class Slice(Sensor):
     """One `[[sensor]]` with `kind = "slice"`."""
 
     paired = True
+    unit = 1.0, "mm"
 
     kind: Literal["slice"]
     plane_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)]

@@ -30,6 +30,8 @@ class View(Range):
     A value is a coordinate across the insertion axis in the image; coordinates along it are not used.
     """
 
+    unit = 1.0, "px"
+
     kind: Literal["view"]
     projection: Annotated[
         tuple[Row, Row, Row], Field(strict=False, json_schema_extra={"allowed": "3 lists of 4 numbers"})
