@@ -326,10 +326,10 @@ class Needles(NamedTuple):
     poses: Floats
     spacing: float
 
-    def at(self, x: float) -> Floats:
-        """Return the poses (m, 5) where needles pass x (mm), straight on beyond their ends."""
+    def at(self, x: float | Floats) -> Floats:
+        """Return the poses (m, 5) where needles pass x (mm), for all or (m,), straight on beyond their ends."""
         last, rows = self.poses.shape[1] - 2, np.arange(len(self.poses))
-        left = np.clip((self.poses[..., X] <= x).sum(axis=1) - 1, 0, last)
+        left = np.clip((self.poses[..., X] <= np.asarray(x)[..., None]).sum(axis=1) - 1, 0, last)
         start, end = self.poses[rows, left], self.poses[rows, left + 1]
         part = (x - start[:, X]) / (end[:, X] - start[:, X])
         found: Floats = start + part[:, None] * (end - start)

@@ -8,7 +8,7 @@ import pytest
 import flexneedle
 from flexneedle.record.fields import page_values
 from flexneedle.record.results import RESULT_KEYS, insertion_result
-from flexneedle.record.sensor_results import sensor_results
+from flexneedle.record.sensor_results import sensor_columns, sensor_results, sensor_row
 from flexneedle.types import OK, CheckedReading, Reading, Verdict, VerdictKind
 from synthetic import make_insertion
 from synthetic_sensors import EXCLUDED_FROM, FROZEN, with_sensors
@@ -41,6 +41,18 @@ def test_the_innovation_is_the_mean_while_the_sensor_is_used():
     assert found.mean_nis == pytest.approx(0.1 * (EXCLUDED_FROM + 1) / 6)
     assert found.excluded == FROZEN
     assert found.excluded_mm == SENSED.periods[EXCLUDED_FROM].estimate.x
+
+
+def test_a_row_of_a_study_has_median_and_verdict_of_each_sensor():
+    row = sensor_row(SENSED)
+    assert row["sensor_fbg_nis"] == pytest.approx(
+        0.1 * (EXCLUDED_FROM + 1) / 6
+    )  # innovations that grow evenly
+    assert (row["sensor_fbg_excluded"], row["sensor_slice_excluded"]) == ("frozen", "")
+    assert row["sensor_fbg_excluded_mm"] == SENSED.periods[EXCLUDED_FROM].estimate.x
+    assert row["sensor_slice_nis"] == 0.8
+    assert row.keys() == sensor_columns(["fbg", "slice"]).keys()
+    assert sensor_row(make_insertion()) == {}
 
 
 def test_a_sensor_that_is_used_again_is_not_excluded():

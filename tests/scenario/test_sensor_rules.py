@@ -127,3 +127,5 @@ def test_poses_at_a_depth_are_on_the_needle_and_straight_beyond_it():
     poses[..., 1] = 0.1 * poses[..., 0]
     found = Needles(poses, 10.0).at(5.0)
     np.testing.assert_allclose(found[:, :2], [[5.0, 0.5], [5.0, 0.5]])
+    each = Needles(poses, 10.0).at(np.array([-5.0, 5.0]))
+    np.testing.assert_allclose(each[:, :2], [[-5.0, -0.5], [5.0, 0.5]])

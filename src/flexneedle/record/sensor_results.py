@@ -1,7 +1,9 @@
 """Results of the sensors along the needle over an insertion: readings, innovations, exclusion, and the tip's sd."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from statistics import median
 from typing import Any
 
 from flexneedle.results import Insertion, Period, Plan
@@ -14,9 +16,9 @@ from flexneedle.types import Point, SensorState, VerdictKind
 class SensorResult:
     """A sensor over an insertion.
 
-    readings: all; missing: readings without a value; rejected: share of the others that was rejected; mean_nis: of its
-    innovations while it was used, NaN without any; excluded: the last verdict, "" if it was used to the end, and the
-    depth of the tip (mm) at that time, NaN if it was used.
+    readings: all; missing: readings without a value; rejected: share of the others that was rejected; mean_nis,
+    median_nis: of its innovations while it was used, NaN without any; excluded: the last verdict, "" if it was used to
+    the end, and the depth of the tip (mm) at that time, NaN if it was used.
     """
 
     name: str
@@ -24,6 +26,7 @@ class SensorResult:
     missing: int
     rejected: float
     mean_nis: float
+    median_nis: float
     excluded: str
     excluded_mm: float
 
@@ -51,6 +54,21 @@ def sensor_values(insertion: Insertion) -> dict[str, Any]:
     results, sds = sensor_results(insertion), tip_sds(insertion)
     known = {} if sds is None else {"tip_sd_mm": list(sds)}
     return known | ({"sensors": [asdict(one) for one in results]} if results else {})
+
+
+def sensor_columns(names: Iterable[str]) -> dict[str, type]:
+    """Return the columns in the table of a study of sensors with these names: types by column."""
+    kinds = {"nis": float, "excluded": str, "excluded_mm": float}
+    return {f"sensor_{name}_{key}": kind for name in names for key, kind in kinds.items()}
+
+
+def sensor_row(insertion: Insertion) -> dict[str, Any]:
+    """Return the values of `sensor_columns`: median NIS, kind of the verdict of an exclusion, and its depth (mm)."""
+    row: dict[str, Any] = {}
+    for one in sensor_results(insertion):
+        values = one.median_nis, one.excluded.partition(":")[0], one.excluded_mm
+        row |= zip(sensor_columns([one.name]), values, strict=True)
+    return row
 
 
 def page_sensors(period: Period, plan: Plan) -> list[dict[str, Any]]:
@@ -82,7 +100,10 @@ def _result(insertion: Insertion, name: str) -> SensorResult:
     used = [state.nis for _, state in steps if state.verdict.ok and not math.isnan(state.nis)]
     last, since = steps[-1][1].verdict, _excluded_mm(steps)
     rejected, nis = 1.0 - good / valid if valid else 0.0, sum(used) / len(used) if used else math.nan
-    return SensorResult(name, len(verdicts), missing, rejected, nis, "" if last.ok else str(last), since)
+    middle = median(used) if used else math.nan
+    return SensorResult(
+        name, len(verdicts), missing, rejected, nis, middle, "" if last.ok else str(last), since
+    )
 
 
 def _excluded_mm(steps: list[tuple[Period, SensorState]]) -> float:

@@ -161,7 +161,8 @@ class SensorConformance:
         require(not excluded, f"the sensor was excluded: {excluded[-1] if excluded else ''}")
         every = [one.verdict for state in states for one in state.readings]
         verdicts = [verdict for verdict in every if verdict.kind is not VerdictKind.MISSING]
-        require(verdicts, "the sensor measured nothing in the insertion: check `sees`, `report` and `read`")
+        hint = "check `sees`, `report` and `read`, or set `scenario` to a deeper insertion"
+        require(verdicts, f"the sensor measured nothing in the insertion: {hint}")
         bad = [str(verdict) for verdict in verdicts if not verdict.ok]
         rejected = f"{len(bad)} of {len(verdicts)} readings were rejected: {bad[-1] if bad else ''}"
         require(len(bad) <= _REJECTED * len(verdicts), rejected)

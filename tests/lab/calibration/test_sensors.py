@@ -13,6 +13,7 @@ from flexneedle.lab.calibration.fit import fit, paths_along, residuals_at
 from flexneedle.lab.calibration.readings import StepReading
 from flexneedle.lab.calibration.rehearsal import Rehearsal, Schedule
 from flexneedle.lab.calibration.session import Session
+from flexneedle.lab.calibration.validation import validate
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import ModelPlant
 from flexneedle.scenario.files import load_scenario
@@ -165,6 +166,24 @@ def test_the_loss_of_a_residual_grows_linearly_beyond_a_few_deviations():
     up, down = (joint.rho(np.array([9.0, more, 1e6 + more]))[0][1:] for more in (h, 0.0))
     np.testing.assert_allclose(slope[1:], (up - down) / h, rtol=1e-3)
     assert (bend[1:] < 0.0).all()
+
+
+def test_a_validation_compares_curvatures_with_the_model_s_needle():
+    """Two readings of a step have the noise over √2; a model of softer tissue is further off."""
+    session = with_curvatures(simulate(4, resting=1, **STIFF), TRUE, 0.6, Fibre(noise=0.25))
+    right, soft = (validate(each.with_values({"sensor": [FIBRE]}), session, (20.0,)) for each in (TRUE, GEL))
+    (row,), (wrong,) = right.sensors, soft.sensors
+    assert (row.sensor, row.unit, row.insertions, row.values) == ("fbg", "1/m", 4, 4 * 13 * 8)
+    assert row.rms == pytest.approx(0.25 / np.sqrt(2.0), rel=0.1)
+    assert row.expected == pytest.approx(
+        np.hypot(0.05 / np.sqrt(2.0), 0.1), rel=0.5
+    )  # and 5 % of up to 3 1/m
+    assert wrong.rms > 2.0 * row.rms
+    assert right.values()["sensors"][0]["rms"] == row.rms
+    assert not list(right.notes)
+    bare = validate(TRUE, session, (20.0,))
+    assert "sensors" not in bare.values()
+    assert next(iter(bare.notes)).startswith("readings of fbg are not compared")
 
 
 def test_rows_of_another_shape_are_refused_in_one_line(still):

@@ -66,6 +66,23 @@ def test_a_study_writes_tables_to_a_new_folder_and_prints_one(capsys, here, monk
     assert "\x1b" not in out + err
 
 
+def test_sensors_along_the_needle_have_columns_and_a_table(capsys, here):
+    sensor = (
+        "sensor = [{ kind = 'slice', plane_mm = 2, phantom = { fault = { kind = 'frozen', depth_mm = 3 } } }]"
+    )
+    (here / "my.toml").write_text(f"{STUDY}[[cases]]\nname = 'slice'\nvalues = {{ {sensor} }}\n")
+    status, out, _ = run(capsys, "study", "my.toml", "--out", "a")
+    assert status == 0
+    rows = pq.read_table("a/runs.parquet").to_pylist()
+    verdicts = {
+        case: {row["sensor_slice_excluded"] for row in rows if row["case"] == case}
+        for case in ("base", "slice")
+    }
+    assert verdicts == {"base": {None}, "slice": {"frozen"}}
+    assert all(row["sensor_slice_excluded_mm"] > 3.0 for row in rows if row["case"] == "slice")
+    assert re.search(r"^ slice, phantom.tracker_bias_mm 0.3 +slice +2 +– +2 frozen ", out, re.MULTILINE)
+
+
 def test_margins_are_entered_by_no_number_of_insertions_that_did_not_run():
     zones = SimpleNamespace(entered=0, count=3, least_clearance_mm=nan, has_clearances=False)
     assert study_command._format_zones(zones) == ("–", "–")

@@ -153,6 +153,11 @@ class AlongPath:
         )
         return found
 
+    def unexplained(self, residuals: Floats, factors: Floats) -> Floats:
+        """Return residuals (r,) less the expected offset, drift and start of the insertion."""
+        found: Floats = residuals - self.fixed @ np.linalg.solve(self.covariance(factors), residuals)
+        return found
+
 
 def path_along(
     means: StepMeans, one: Recording, shapes: Floats, length: float, target: float, found: Along, alike: int

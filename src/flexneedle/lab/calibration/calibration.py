@@ -27,7 +27,7 @@ from flexneedle.lab.calibration.parameters import (
     trial_of,
     with_trial,
 )
-from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
+from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, read_sensors, shallow
 from flexneedle.lab.calibration.session import Session
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -219,9 +219,8 @@ def make_problem(scenario: Scenario, session: Session, names: Sequence[str]) -> 
     """Return the fit of parameters by name. Raises as `calibrate`."""
     used = shallow(session)
     prepared, replay = fitting_scenario(scenario, used), Replay.of(used)
-    read = {each.sensor for one in used.recordings for each in one.readings}
-    sensors = tuple(each for each in prepared.sensor if each.title in read)
-    return Problem(prepared, parameters_of(prepared, names, replay.reached), replay, sensors)
+    parameters = parameters_of(prepared, names, replay.reached)
+    return Problem(prepared, parameters, replay, read_sensors(prepared, used))
 
 
 def _minimize(problem: Problem) -> tuple[Fitted, tuple[Fitted, ...]]:

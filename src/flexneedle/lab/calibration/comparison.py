@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from flexneedle.lab.calibration.fit import Fitted, Problem, conclude, fit, paths
 from flexneedle.lab.calibration.folds import Fold, sessions_of
 from flexneedle.lab.calibration.forecast import Forecast, forecast
 from flexneedle.lab.calibration.parameters import Parameter, parameters_of
-from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, shallow
+from flexneedle.lab.calibration.prediction import Replay, fitting_scenario, read_sensors, shallow
 from flexneedle.lab.calibration.session import GuideOrder, Recording, Session
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Flags, Floats
@@ -111,12 +112,13 @@ def fit_nuisances(scenario: Scenario, training: Session, drift: float) -> Fitted
 
     drift: change of ln of the moduli from an insertion to the next.
     """
-    replay = Replay.of(shallow(training))
+    used = shallow(training)
+    replay, sensors = Replay.of(used), read_sensors(scenario, used)
     fixed = [_fix(each, drift) for each in parameters_of(scenario, ("drift",), 0.0) if drift != 0.0]
     free = parameters_of(scenario, ("bevel",), 0.0) if scenario.needle.bevel.offset_mm > 0.0 else ()
-    start = _fit_direction(Problem(scenario, (*free, *fixed), replay), len(free))
+    start = _fit_direction(Problem(scenario, (*free, *fixed), replay, sensors), len(free))
     known = [_fix(each, value) for each, value in zip(free, start.tolist(), strict=False)]
-    return fit(Problem(scenario, (*known, *fixed), replay), PredictionErrors, start)
+    return fit(Problem(scenario, (*known, *fixed), replay, sensors), PredictionErrors, start)
 
 
 def _fit_direction(problem: Problem, axes: int) -> Floats:
@@ -169,6 +171,37 @@ def _errors(number: int, tested: Tested, pairs: Pairs, simple: Mapping[str, Pred
         size,
         np.abs(off) <= WIDTH * found.sd[i, j],
     )
+
+
+class SensorRow(NamedTuple):
+    """Readings of a sensor along the needle beside the model's needle: rms of the errors, and as expected, in a unit.
+
+    insertions, values: number of the insertions that have readings, and of values at their steps.
+    """
+
+    sensor: str
+    unit: str
+    insertions: int
+    values: int
+    rms: float
+    expected: float
+
+    def __str__(self) -> str:
+        size = f"{self.rms:.2g} {self.unit}".rstrip()
+        return (
+            f"Readings of {self.sensor} in {self.insertions} insertions: {size} (rms) from the model's needle, "
+            f"{self.rms / self.expected:.2g} times its noise and model error"
+        )
+
+
+def sensor_rows(tested: Sequence[Tested]) -> Iterator[SensorRow]:
+    """Yield a row for each sensor along the needle that has readings."""
+    every = [each for one in tested for each in one.forecast.along]
+    for name in dict.fromkeys(each.sensor for each in every):
+        own = [each for each in every if each.sensor == name]
+        errors = np.concatenate([(each.size, each.expected) for each in own], axis=1)
+        rms, expected = np.sqrt(np.mean(errors**2, axis=1)).tolist()
+        yield SensorRow(name, own[0].unit, len(own), errors.shape[1], rms, expected)
 
 
 def guide_motion(one: Recording) -> Floats:

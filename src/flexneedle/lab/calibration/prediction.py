@@ -11,6 +11,7 @@ from flexneedle.errors import InputError
 from flexneedle.lab.calibration.parameters import Needle
 from flexneedle.lab.calibration.session import STILL, Recording, Session
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, Flags, Floats
 
 _LEAST_STEPS = 3  # for a turn that is no outlier
@@ -120,6 +121,12 @@ class Replay:
 def shallow(session: Session) -> Session:
     """Return the session with each insertion up to the step from which the needle has turned by more than `STEEP`."""
     return replace(session, recordings=tuple(one.first(_shallow_steps(one)) for one in session.recordings))
+
+
+def read_sensors(scenario: Scenario, session: Session) -> tuple[Sensor, ...]:
+    """Return the sensors along the needle of a scenario that have readings in a session."""
+    read = {each.sensor for one in session.recordings for each in one.readings}
+    return tuple(each for each in scenario.sensor if each.title in read)
 
 
 def _shallow_steps(one: Recording) -> int:

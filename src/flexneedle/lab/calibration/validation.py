@@ -11,7 +11,15 @@ from threadpoolctl import threadpool_limits
 
 from flexneedle.errors import InputError
 from flexneedle.lab.calibration.calibration import Calibration
-from flexneedle.lab.calibration.comparison import Errors, Tested, errors_ahead, errors_at_end, predict_fold
+from flexneedle.lab.calibration.comparison import (
+    Errors,
+    SensorRow,
+    Tested,
+    errors_ahead,
+    errors_at_end,
+    predict_fold,
+    sensor_rows,
+)
 from flexneedle.lab.calibration.folds import split
 from flexneedle.lab.calibration.session import Session
 from flexneedle.lab.calibration.verdicts import (
@@ -86,6 +94,20 @@ class Validation:
         whole = [row for row in self.rows if row.group == "all"]
         return headline(self.verdicts), *map(str, self.verdicts), judge_coverage(whole)
 
+    @cached_property
+    def sensors(self) -> tuple[SensorRow, ...]:
+        """Readings of sensors along the needle beside the model's needle."""
+        return tuple(sensor_rows(self.tested))
+
+    @property
+    def notes(self) -> Iterator[str]:
+        """Yield which readings of sensors along the needle are not compared."""
+        read = (each.sensor for one in self.tested for each in one.recording.readings)
+        compared = {row.sensor for row in self.sensors}
+        for name in dict.fromkeys(read):
+            if name not in compared:
+                yield f"readings of {name} are not compared: no [[sensor]] of this name, or no training with them"
+
     def __repr__(self) -> str:
         ahead = ", ".join(f"{each:g}" for each in self.ahead)
         return f"<Validation of {len(self.tested)} insertions, {ahead} mm ahead>"
@@ -114,6 +136,7 @@ class Validation:
             "verdict": list(self.verdict),
             "comparisons": [each.values() for each in self.verdicts],
             "rows": [row.values() for row in self.rows],
+            **({"sensors": [row._asdict() for row in self.sensors]} if self.sensors else {}),
         }
 
 

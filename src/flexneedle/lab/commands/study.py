@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
     from flexneedle.lab.study.findings.findings import Findings
     from flexneedle.lab.study.findings.groups import SettingGroup
+    from flexneedle.lab.study.findings.sensors import SensorGroup
     from flexneedle.lab.study.runner import StudyProgress
 
 
@@ -207,6 +208,19 @@ def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
             f"All insertions: least clearance of the true needle (mm); insertions with one more than {ENTERED_MM:g} mm "
             "below the least margin.\n"
         )
+    if found.sensors:
+        print_table(
+            "Sensors along the needle",
+            ("", "sensor", "insertions", "NIS", "excluded", "depth"),
+            (
+                _format_sensor(one, _label(one.levels, varied) or found.groups[0].name)
+                for one in found.sensors
+            ),
+        )
+        print(
+            "All insertions: median of the medians of NIS; insertions in which the sensor is excluded to the end, and "
+            "median depth (mm) from which it is.\n"
+        )
     print_table("Load on the tissue", load_heads, ((name, *_format_load(group)) for name, group in rows))
     print(
         f"Over finished insertions: {found.energy_means} of peak, mean and end of the tissue energy; means of each "
@@ -224,6 +238,17 @@ def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
 def _format_zones(group: SettingGroup) -> Sequence[str]:
     entered = f"{group.entered} of {group.count}" if group.has_clearances else "–"
     return _number(group.least_clearance_mm), entered
+
+
+def _format_sensor(one: SensorGroup, name: str) -> Sequence[str]:
+    return (
+        name,
+        one.sensor,
+        str(one.count),
+        _number(one.median_nis, 2),
+        one.verdicts,
+        _number(one.excluded_mm, 1),
+    )
 
 
 def _label(levels: Mapping[str, str], varied: Sequence[str]) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import add_width, print_json, print_table
+from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import positive
 
 if TYPE_CHECKING:
@@ -67,6 +68,8 @@ def _validate(args: argparse.Namespace) -> int:
     else:
         _print(found)
         print(f"\nPage: {page}")
+    for line in found.notes:
+        print_note(line)
     return 0
 
 
@@ -80,7 +83,7 @@ def _print(found: Validation) -> None:
     parts = [row for row in found.rows if not row.main]
     print_table("By depth, order and session", heads, _lines(parts, "model", "regression"))
     print(f"{found.sentence}.\n")
-    for line in found.verdict:
+    for line in (*found.verdict, *found.sensors):
         print(line)
 
 

@@ -17,6 +17,7 @@ from flexneedle.planning.events import Listener
 from flexneedle.planning.planner import plan
 from flexneedle.record.plain import plain, plan_values
 from flexneedle.record.results import RESULT_COLUMNS, insertion_row, plan_row
+from flexneedle.record.sensor_results import sensor_row
 from flexneedle.results import Insertion, Plan
 
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
@@ -78,7 +79,7 @@ def _make_row(job: InsertionJob, seed: int) -> dict[str, Any]:
         except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
             results["reason"] = describe_error(error)
         else:
-            results |= insertion_row(insertion)
+            results |= insertion_row(insertion) | sensor_row(insertion)
             times = _sum_times(insertion)
     times["total_s"] = time.perf_counter() - begun
     if job.with_reach:

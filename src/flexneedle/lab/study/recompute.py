@@ -14,6 +14,7 @@ from flexneedle.planning.events import Event
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain
 from flexneedle.record.results import insertion_row
+from flexneedle.record.sensor_results import sensor_row
 from flexneedle.results import Insertion
 
 WITHOUT = ("refused", "error")
@@ -92,7 +93,7 @@ def _describe_version(recorded: RecordedStudy) -> str:
 
 def _find_difference(insertion: Insertion, row: Mapping[str, Any]) -> str:
     """Return the first difference from the recorded row, or ""; the reason, which may include the reach, may differ."""
-    again = plain(insertion_row(insertion))
+    again = plain(insertion_row(insertion) | sensor_row(insertion))
     for name in ("outcome", _ERROR, *again):
         if name != "reason" and name in row and again[name] != row[name]:
             unit = " mm" if name == _ERROR else ""

@@ -13,6 +13,7 @@ from flexneedle.lab.study.jobs import TIMES
 from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
 from flexneedle.record.folder import versions
 from flexneedle.record.results import RESULT_COLUMNS
+from flexneedle.record.sensor_results import sensor_columns
 from flexneedle.scenario.alternatives import YOUNG
 
 RUNS_FILE, TIMING_FILE = "runs.parquet", "timing.parquet"
@@ -95,12 +96,14 @@ def _make_runs(
         _list_conditions(insertion, key) for insertion, key in zip(insertions, plan_keys, strict=True)
     ]
     version_columns = {f"version_{name}": [value] * len(insertions) for name, value in versions().items()}
+    sensors = dict.fromkeys(one.title for point in study.points for one in point.scenario.sensor)
     cases = [{"index": insertion.index, "case": insertion.point.case} for insertion in insertions]
     return pa.table(
         _make_columns(cases, {"index": int, "case": str})
         | _make_columns(settings, _find_kinds(list(flats.values())))
         | _make_columns(conditions, {name: kind for name, (kind, _) in _CONDITIONS.items()})
         | _make_columns(results, {name: column.kind for name, column in RESULT_COLUMNS.items()})
+        | _make_columns(results, sensor_columns(sensors))
         | {name: pa.array(values, pa.string()) for name, values in version_columns.items()}
     )
 

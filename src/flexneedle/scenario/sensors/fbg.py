@@ -32,7 +32,8 @@ class Fbg(KeyedSensor):
     """One `[[sensor]]` with `kind = "fbg"`."""
 
     paired, rolls = True, True
-    keys = Keys("noise_per_m", "bias_per_m", "wander_per_m", "1/m", _PER_M)
+    keys = Keys("noise_per_m", "bias_per_m", "wander_per_m")
+    unit = 1.0 / _PER_M, "1/m"
 
     kind: Literal["fbg"]
     sites_mm: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=1000)]

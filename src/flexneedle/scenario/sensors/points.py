@@ -49,7 +49,8 @@ class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
 
     paired = True
-    keys = Keys("noise_mm", "place_sd_mm", "wander_mm", "mm")
+    keys = Keys("noise_mm", "place_sd_mm", "wander_mm")
+    unit = 1.0, "mm"
 
     kind: Literal["points"]
     rate_hz: Positive = 2.0

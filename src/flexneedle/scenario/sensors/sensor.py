@@ -60,13 +60,11 @@ class SensorErrors(Section):
 
 
 class Keys(NamedTuple):
-    """Keys of a kind for its noise, offset and wander, with their unit, and its size in the unit of the values."""
+    """Keys of a kind for its noise, offset and wander, in its `unit`."""
 
     noise: str = ""
     offset: str = ""
     wander: str = ""
-    unit: str = ""
-    size: float = 1.0
 
 
 class Sensor(Section):
@@ -81,6 +79,8 @@ class Sensor(Section):
     """True: the sensor is in the needle and rolls with it. Its values are `paired`."""
     keys: ClassVar[Keys] = Keys()
     """Names for the results of `flexneedle sensor check`."""
+    unit: ClassVar[tuple[float, str]] = 1.0, ""
+    """Factor and unit with which values are shown."""
 
     kind: str
     """`fbg`, `slice`, `points`, `view` or `module:NAME`."""
@@ -207,7 +207,7 @@ class KeyedSensor(Sensor):
         return self._size(self.keys.wander)
 
     def _size(self, key: str) -> float:
-        return self.keys.size * float(getattr(self, key))
+        return float(getattr(self, key)) / self.unit[0]
 
 
 def flatten(rows: Matrix, size: int, width: int | None) -> "Floats":

@@ -34,7 +34,8 @@ class Slice(KeyedSensor):
     """One `[[sensor]]` with `kind = "slice"`."""
 
     paired = True
-    keys = Keys("noise_mm", "pose_sd_mm", "wander_mm", "mm")
+    keys = Keys("noise_mm", "pose_sd_mm", "wander_mm")
+    unit = 1.0, "mm"
 
     kind: Literal["slice"]
     plane_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)]

@@ -30,7 +30,8 @@ class View(Range):
     A value is a coordinate across the insertion axis in the image; coordinates along it are not used.
     """
 
-    keys = Keys("noise_px", "pose_sd_px", "wander_px", "px")
+    keys = Keys("noise_px", "pose_sd_px", "wander_px")
+    unit = 1.0, "px"
 
     kind: Literal["view"]
     projection: Annotated[

@@ -309,6 +309,20 @@ def test_coverage_counts_both_axes_of_tip_and_middle(report_on):
     assert np.isnan(found.in_vain)
 
 
+def test_sensors_are_reported_with_medians_and_exclusions(report_on):
+    rows = make_rows(targets=TARGETS[:1], repeats=4)
+    assert "Sensors along the needle" not in report_on(rows)[1].text
+    seen = [(0.5, "", None), (0.9, "frozen", 12.0), (None, "contradicted", 20.0), (None, None, None)]
+    keys = [f"sensor_slice 1.5_{key}" for key in ("nis", "excluded", "excluded_mm")]
+    rows = [row | dict(zip(keys, values, strict=True)) for row, values in zip(rows, seen, strict=True)]
+    report, page = report_on(rows)
+    (found,) = report.findings.sensors
+    assert (found.sensor, found.count, found.median_nis, found.excluded_mm) == ("slice 1.5", 3, 0.7, 16.0)
+    assert report.values()["sensors"][0]["excluded"] == {"frozen": 1, "contradicted": 1}
+    assert "1 frozen, 1 contradicted" in page.text
+    assert keys[0] not in page.text
+
+
 def test_text_from_data_is_escaped(sketched_on, rows):
     about = {"command": EVIL, "study": ABOUT["study"] | {"title": EVIL}}
     evil = [

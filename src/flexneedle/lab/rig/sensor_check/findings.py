@@ -162,21 +162,23 @@ class _SensorCheck:
         return f"{key} = {corrected(float(now)):.4g}", "rig file"
 
     def _offset(self) -> SensorError:
-        keys, each, allowed = self._sensor.keys, self._fit.offset(self._number), self._sensor.offset_sd
+        keys, (factor, unit) = self._sensor.keys, self._sensor.unit
+        each, allowed = self._fit.offset(self._number), self._sensor.offset_sd
         value, sd = max(each, key=lambda one: abs(one[0]) / math.hypot(one[1], allowed or 1.0))
         is_off = self._is_off("offset", value, sd, allowed) and keys.offset
-        line = f"{keys.offset} = {abs(value) / keys.size:.2g}" if is_off else ""
+        line = f"{keys.offset} = {abs(value) * factor:.2g}" if is_off else ""
         note = f"largest of {len(each)}" + (", with the natural bend" if self._sensor.rolls else "")
-        shown = f"± {allowed / keys.size:.3g}"
-        return self._error("offset", value / keys.size, sd / keys.size, keys.unit, shown, note, line)
+        shown = f"± {allowed * factor:.3g}"
+        return self._error("offset", value * factor, sd * factor, unit, shown, note, line)
 
     def _readings_errors(self) -> Iterator[SensorError]:
         """Yield noise, rate, and lost and outlying readings."""
         sensor, keys, number = self._sensor, self._sensor.keys, self._number
-        noise, expected = self._fit.noise[number] / keys.size, sensor.noise / keys.size
+        factor, unit = sensor.unit
+        noise, expected = self._fit.noise[number] * factor, sensor.noise * factor
         fits = 1.0 / _NOISE < noise / expected < _NOISE or not keys.noise
         line = "" if fits else f"{keys.noise} = {noise:.2g}"
-        yield self._error("noise", noise, 0.0, keys.unit, f"{expected:.3g}", "", line)
+        yield self._error("noise", noise, 0.0, unit, f"{expected:.3g}", "", line)
         times = [one.time for one in self._readings]
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         line = "" if 1.0 / _RATE < rate / sensor.rate_hz < _RATE else f"rate_hz = {rate:.3g}"

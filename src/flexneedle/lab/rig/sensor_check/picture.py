@@ -30,10 +30,10 @@ def _draw_sensor(whole: Axes, part: Axes, fit: AirFit, number: int, before: Floa
     """Draw the value with the largest scatter of its prediction; the part is where that changes fastest."""
     one, after, used = fit.model.sensors[number], fit.predicted[number], fit.used[number]
     column = int(np.argmax(np.where(used.any(axis=0), after.std(axis=0), -1.0)))
-    keys = one.sensor.keys
+    factor, unit = one.sensor.unit
     kept, time = used[:, column], one.time
     value, *predicted = (
-        np.where(kept, rows[:, column] / keys.size, np.nan) for rows in (one.value, before, after)
+        np.where(kept, factor * rows[:, column], np.nan) for rows in (one.value, before, after)
     )
     for panel in (whole, part):
         panel.plot(time, value, ".", color=MEASURED, markersize=2, alpha=0.5, label="measured")
@@ -45,7 +45,7 @@ def _draw_sensor(whole: Axes, part: Axes, fit: AirFit, number: int, before: Floa
                 time[drawn], line[drawn], style, color=color, linewidth=1.0, label=f"predicted, {name} errors"
             )
         panel.set_xlabel("time (s)")
-    whole.set(title=one.name, ylabel=f"value {column + 1} of {after.shape[1]} ({keys.unit})")
+    whole.set(title=one.name, ylabel=f"value {column + 1} of {after.shape[1]} ({unit})")
     seen, curve = time[kept], after[kept, column]
     change = np.interp(seen + _NEAR_S, seen, curve) - np.interp(seen - _NEAR_S, seen, curve)
     middle = seen[int(np.argmax(np.abs(change)))]

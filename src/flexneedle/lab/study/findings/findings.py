@@ -19,6 +19,7 @@ from flexneedle.lab.study.findings.groups import (
 )
 from flexneedle.lab.study.findings.predictions import Predictions, assess_predictions
 from flexneedle.lab.study.findings.reading import StudyTables
+from flexneedle.lab.study.findings.sensors import SensorGroup, group_sensors
 from flexneedle.lab.study.findings.statistics import CONFIDENCE, RESAMPLES, SEED
 from flexneedle.lab.study.findings.worlds import WorldGroup, group_worlds
 
@@ -31,7 +32,7 @@ class Findings:
 
     outcomes: insertions by outcome, "done" first; whole: one group per controller over all its insertions; groups:
     one per combination of settings; worst: rows with the largest errors, in worlds only of the first controller;
-    worlds: empty in other studies; predictions: of controllers that predict the miss.
+    worlds: empty in other studies; predictions: of controllers that predict the miss; sensors: along the needle.
     """
 
     study: StudyTables
@@ -45,6 +46,7 @@ class Findings:
     worst: Sequence[int]
     worlds: Sequence[WorldGroup]
     predictions: Sequence[Predictions]
+    sensors: Sequence[SensorGroup]
 
     @property
     def planned(self) -> int:
@@ -96,6 +98,7 @@ class Findings:
             "cases": list(map(asdict, self.cases)),
             "worlds": list(map(asdict, self.worlds)),
             "predictions": list(map(asdict, self.predictions)),
+            **({"sensors": list(map(asdict, self.sensors))} if self.sensors else {}),
             "endings": list(map(asdict, self.endings)),
             "worst": [
                 {name: rows.value(name, row) for name in ("index", "true_error_mm", "outcome")}
@@ -122,4 +125,5 @@ def compute_findings(study: StudyTables) -> Findings:
         find_worst(rows, among=design.controller.codes == 0 if rows.has_worlds else None),
         group_worlds(rows, design),
         assess_predictions(rows, design),
+        group_sensors(rows, design),
     )

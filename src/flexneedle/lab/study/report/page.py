@@ -74,7 +74,8 @@ def list_versions(rows: InsertionRows) -> dict[str, str]:
 
 def list_settings(rows: InsertionRows) -> dict[str, str]:
     """Return the settings of the scenario as text: the value, or the number of values."""
-    levels = {name: list(dict.fromkeys(rows.values(name))) for name in rows.names if "." in name}
+    names = [name for name in rows.names if "." in name and not name.startswith("sensor_")]
+    levels = {name: list(dict.fromkeys(rows.values(name))) for name in names}
     return {
         name: format_value(found[0]) if len(found) == 1 else f"varies: {len(found)} values"
         for name, found in levels.items()
