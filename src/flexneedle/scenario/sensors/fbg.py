@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _PER_M = 1e-3
 _MODEL_PER_M = 0.01
 _STEP_MM = 1.0
+_ALIKE_MM = 20.0
 _MODEL_SHARE = 0.05  # of the curvature of a site
 
 
@@ -71,6 +72,12 @@ class Fbg(Sensor):
     def noise(self) -> float:
         """Standard deviation of the white noise, 1/mm."""
         return _PER_M * self.noise_per_m
+
+    @property
+    def alike(self) -> int:
+        """Return the number of sites in 20 mm."""
+        length = self.sites_mm[-1] - self.sites_mm[0]
+        return 1 + int((len(self.sites_mm) - 1) * _ALIKE_MM / max(length, _ALIKE_MM))
 
     @property
     def offset_sd(self) -> float:

@@ -75,6 +75,11 @@ class Points(Range):
         return self.noise_mm
 
     @property
+    def alike(self) -> int:
+        """Return the number of stations: the model's error is one of the shape."""
+        return _STATIONS
+
+    @property
     def offset_sd(self) -> float:
         """Prior standard deviation of the constant error, mm."""
         return self.place_sd_mm

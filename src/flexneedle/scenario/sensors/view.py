@@ -104,6 +104,11 @@ class View(Range):
         return self.noise_px
 
     @property
+    def alike(self) -> int:
+        """Return the number of stations: the model's error is one of the shape."""
+        return _STATIONS
+
+    @property
     def offset_sd(self) -> float:
         """Prior standard deviation of the constant error, pixels."""
         return self.pose_sd_px
