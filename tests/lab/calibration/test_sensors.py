@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.calibration.along import Joint, estimate_factors, read_means
+from flexneedle.lab.calibration.along import AlongPath, Joint, estimate_factors, read_means
 from flexneedle.lab.calibration.calibration import calibrate, make_problem
 from flexneedle.lab.calibration.criteria import Likelihood
 from flexneedle.lab.calibration.fit import fit, paths_along, residuals_at
@@ -128,6 +128,19 @@ def test_residuals_have_the_covariance_of_their_errors(still):
     drawn = (noise + offset + np.tile(drift, 4)).reshape(draws, -1)
     given = np.diag(path.white) + path.fixed
     np.testing.assert_allclose(given, np.cov(drawn.T), atol=0.05 * given.max())
+
+
+def test_the_error_of_a_shape_counts_once_in_a_session():
+    """The mean of 12 points in each of 4 insertions has the variance of one; distant sites are independent."""
+    points = load_scenario("gel").with_values({"sensor": [{"kind": "points", "to_mm": 60.0}]}).sensor[0]
+    path = AlongPath(0, "points", np.ones(12), 0.04 * np.eye(12), np.zeros((12, 12)), 4 * points.alike)
+    shown = path.covariance(np.array([0.0, 1.0]), path.alike)
+    assert np.mean(shown) / 4 == pytest.approx(0.04)
+    fibres = [
+        FITTED.sensor[0].model_copy(update={"sites_mm": sites})
+        for sites in ((8.0, 20.0, 45.0, 80.0), range(1, 102))
+    ]
+    assert [fibre.alike for fibre in fibres] == [1, 21]
 
 
 def test_a_noisier_fibre_counts_less():

@@ -7,7 +7,8 @@ of each site. The residuals of an insertion have, by the values of a sensor, the
 
 white noise of the means at a step, an error of the model that is correlated over `_LASTING_MM` of advance, an offset
 and a drift of that insertion, and the lateral position and heading with which the needle begins, which are unknown for
-the tip, too. The factors a and b follow from the residuals, by the greatest likelihood.
+the tip, too. The factors a and b follow from the residuals, by the greatest likelihood. In the fit the error of the
+model counts once for all insertions of a session, and all values of a sensor in a direction, in which it is alike.
 """
 
 import math
@@ -133,7 +134,8 @@ class AlongPath:
     """Covariances of the residuals (r,) of a sensor in a recording.
 
     recording: its number; sensor: name; white (r,): variances of the means; model (r, r): of the model's error; fixed
-    (r, r): of offset, drift and start; alike: insertions of the session, which have the same error of the model.
+    (r, r): of offset, drift and start; alike: insertions of the session times values in a direction that have the same
+    error of the model.
     """
 
     recording: int
@@ -146,7 +148,7 @@ class AlongPath:
     def covariance(self, factors: Floats, alike: int = 1) -> Floats:
         """Return the covariance (r, r), with factors (2,) on the standard deviations of noise and model error.
 
-        alike: number of insertions whose mean has the model's error of one.
+        alike: number of insertions and values whose mean has the model's error of one.
         """
         found: Floats = (
             factors[0] ** 2 * np.diag(self.white) + alike * factors[1] ** 2 * self.model + self.fixed
@@ -183,7 +185,7 @@ def path_along(
     white = (sensor.noise**2 / np.maximum(bins.count, 1.0) + sensor.wander_sd**2)[known]
     fixed = sensor.offset_sd**2 * offsets @ offsets.T + starts @ starts.T
     fixed += sensor.drift_sd**2 * grown * (drifts @ drifts.T)
-    return AlongPath(means.recording, fit.name, white, model, fixed, alike)
+    return AlongPath(means.recording, fit.name, white, model, fixed, alike * sensor.alike)
 
 
 def _starts(means: StepMeans, one: Recording, at: Floats, length: float, planned: Floats) -> Floats:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _PER_M = 1e-3
 _MODEL_PER_M = 0.01
 _STEP_MM = 1.0
+_ALIKE_MM = 20.0
 _MODEL_SHARE = 0.05  # of the curvature of a site
 
 
@@ -67,6 +68,12 @@ class Fbg(KeyedSensor):
         if any(later <= earlier for earlier, later in pairwise(sites)):
             raise ValueError("must rise, from the tip on")
         return sites
+
+    @property
+    def alike(self) -> int:
+        """Return the number of sites in 20 mm."""
+        length = self.sites_mm[-1] - self.sites_mm[0]
+        return 1 + int((len(self.sites_mm) - 1) * _ALIKE_MM / max(length, _ALIKE_MM))
 
     @property
     def drift_sd(self) -> float:

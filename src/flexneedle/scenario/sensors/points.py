@@ -70,6 +70,11 @@ class Points(Range):
         """X (s,) at which readings are compared; a point is shifted to the nearest along the predicted needle."""
         return np.linspace(self.from_mm, self.to_mm, _STATIONS)
 
+    @property
+    def alike(self) -> int:
+        """Return the number of stations: the model's error is one of the shape."""
+        return _STATIONS
+
     def size(self, axes: int) -> int:
         """Return the number of coordinates across the needle."""
         return axes * _STATIONS

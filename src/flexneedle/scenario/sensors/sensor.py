@@ -134,6 +134,11 @@ class Sensor(Section):
         return np.full(values.shape, _MODEL_NOISE * self.noise)
 
     @property
+    def alike(self) -> int:
+        """Number of values in a direction whose errors of the model are the same (default: 1)."""
+        return 1
+
+    @property
     def offset_sd(self) -> float:
         """Prior standard deviation of the constant error of a value."""
         return 0.0

@@ -86,6 +86,11 @@ class View(Range):
         """Pixels (s,) along the axis at which readings are compared."""
         return np.linspace(0.0, self._axis[2], _STATIONS)
 
+    @property
+    def alike(self) -> int:
+        """Return the number of stations: the model's error is one of the shape."""
+        return _STATIONS
+
     def size(self, axes: int) -> int:
         """Return the number of stations."""
         del axes
