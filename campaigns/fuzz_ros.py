@@ -221,8 +221,8 @@ class Consumers:
         self.nodes = SilentNode(), SilentNode(), SilentNode(), SilentNode()
         sites = SiteMap((30.0, 20.0, 10.0), (15.0, 30.0), MountingSettings())
         self.sensors = (
-            RosSensor(self.nodes[2], WallClock(), 0.25, "sensors.shape"),
-            RosFbg(self.nodes[3], WallClock(), 0.25, "sensors.curvatures", sites, 0.02),
+            RosSensor(self.nodes[2], WallClock(), 0.25, "sensors.shape", 0.1),
+            RosFbg(self.nodes[3], WallClock(), 0.25, "sensors.curvatures", 0.02, sites),
         )
         self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)
         link = JointLink.__new__(JointLink)

@@ -139,9 +139,11 @@ def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
     tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
     name = max(odds, key=lambda name: odds[name], default="")
     if most > _FAULTY and most - tip > _CLEAR:
-        return name, Verdict(VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:g}")
+        return name, Verdict(
+            VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:.1f}"
+        )
     if tip > _IN_DOUBT and most - tip < _CLEAR:
-        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {_IN_DOUBT:g}"
+        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {_IN_DOUBT:.1f}"
         if tip - most > _CLEAR:
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
         return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
