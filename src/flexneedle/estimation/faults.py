@@ -82,7 +82,7 @@ def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
     if all(one.is_common for one in rows.values()):
         return common
     single = _compute_all(fitted, rows, places, left, covariance + _DOUBT**2 * error, single=True)
-    return {name: max(common[name], single[name]) for name in common}
+    return common | {name: max(common[name], one) for name, one in single.items()}
 
 
 def _compute_all(
@@ -99,6 +99,8 @@ def _compute_all(
     weighted, depth = precision @ left, float(fitted.tips[-1, X])
     found = {}
     for name, one in rows.items():
+        if single and one.is_common:
+            continue
         own, size = places[name], _size(fitted, name)
         value = one.value if single else one.value % one.across
         found[name] = _find_fault(one.depth, value, weighted[own], precision[own, own], size, depth)

@@ -1,6 +1,7 @@
 """An image plane that the needle crosses, such as a slice of ultrasound, CT or MRI."""
 
 import math
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
@@ -56,7 +57,7 @@ class Slice(KeyedSensor):
     _shift: Any = PrivateAttr((0.0, 0.0, 0.0))  # of the true image (mm)
     _turn: Any = PrivateAttr((0.0, 0.0, 0.0))  # its rotation vector (rad)
 
-    @property
+    @cached_property
     def frame(self) -> "Floats":
         """Rows (3, 3): normal, and the directions in the plane nearest to y and to z."""
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
@@ -67,7 +68,9 @@ class Slice(KeyedSensor):
 
     def _in_frame(self, points: "Floats") -> tuple["Floats", "Floats"]:
         """Return the distance (…) of points (…, 3) from the plane, and their coordinates (…, 2) in it."""
-        frame = self.frame + np.cross(self._turn, self.frame)  # of a small rotation
+        frame = self.frame
+        if any(self._turn):
+            frame = frame + np.cross(self._turn, frame)  # of a small rotation
         places = (points - [self.plane_mm, 0.0, 0.0] - self._shift) @ frame.T
         return places[..., 0], places[..., 1:]
 
