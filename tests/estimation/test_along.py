@@ -1,10 +1,13 @@
 """Sensors along the needle in the fit: derivatives by finite differences, and linear problems with known answers."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from flexneedle.estimation.along import between, whiten
-from flexneedle.estimation.fit import differentiate, simulate_due
+from flexneedle.estimation.fit import differentiate, lasting_covariance, simulate_due
+from flexneedle.estimation.fitted import LASTING
 from sensed import followed
 
 
@@ -110,3 +113,17 @@ def test_readings_are_averaged_over_the_moves_in_which_they_were_taken():
     np.testing.assert_allclose(
         between(bins, np.arange(len(line.begun) + 1.0)[:, None])[:, 0], bins.index + bins.part
     )
+
+
+def test_errors_of_the_model_that_last_add_what_they_have_in_common():
+    """Against a sum over all pairs of readings of a sensor, one after another."""
+    estimate, _ = followed()
+    gains = np.random.default_rng(3).normal(size=(2, estimate.parameters.size))
+    known = np.zeros((2, 2))
+    for k, one in enumerate(estimate.along):
+        bins, error = estimate.bins[k], one.sensor.model_error(estimate.bins[k].value)
+        pull = np.einsum("nk,bdk->nbd", gains, estimate.along_jacobians[k]) / one.variances(bins)
+        for i, j in itertools.permutations(range(len(bins.index)), 2):
+            alike = np.exp(-abs(int(bins.index[i]) - int(bins.index[j])) / LASTING)
+            known += alike * (pull[:, i] * error[i]) @ (pull[:, j] * error[j]).T
+    np.testing.assert_allclose(lasting_covariance(estimate, gains), known, rtol=1e-9)
