@@ -127,3 +127,13 @@ def test_errors_of_the_model_that_last_add_what_they_have_in_common():
             alike = np.exp(-abs(int(bins.index[i]) - int(bins.index[j])) / LASTING)
             known += alike * (pull[:, i] * error[i]) @ (pull[:, j] * error[j]).T
     np.testing.assert_allclose(lasting_covariance(estimate, gains), known, rtol=1e-9)
+
+
+def test_an_offset_is_constant_in_the_sensor_s_axes():
+    estimate, _ = followed()
+    one, bins = estimate.along[0], estimate.bins[0]
+    still = np.abs(bins.facing) > 1.0 - 1e-9
+    rows = estimate.along_jacobians[0].transpose(2, 0, 1)[one.slots.offset]
+    own = one.in_its_axes(rows, bins)[:, still]
+    assert np.ptp(rows[:, still], axis=1).max() > 1.0
+    np.testing.assert_allclose(own, np.broadcast_to(np.eye(one.size)[:, None], own.shape), atol=1e-9)
