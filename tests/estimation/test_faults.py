@@ -58,20 +58,55 @@ def test_a_drift_is_found_with_its_sensor_and_its_onset():
     assert depth - 20.0 <= found[name].since <= depth - 5.0
 
 
+def moved(estimate, off):
+    """The estimate with the tracker's y moved by a function of the depth."""
+    moves = []
+    for done, tip in zip(estimate.moves, estimate.tips[1:], strict=True):
+        more = off(float(tip[0]))
+        readings = tuple(replace(one, y=one.y + more) for one in done.measurements)
+        moves.append(replace(done, measurements=readings))
+    return estimate.change(moves=tuple(moves))
+
+
 def test_an_error_of_the_tracker_that_grows_is_the_tracker_s():
     """A slope that the start of the needle would explain, but not the curvatures."""
     estimate, _ = followed()
-    moves = []
-    for done, tip in zip(estimate.moves, estimate.tips[1:], strict=True):
-        off = 0.1 * max(0.0, float(tip[0]))
-        moves.append(
-            replace(done, measurements=tuple(replace(one, y=one.y + off) for one in done.measurements))
-        )
-    found = find_faults(estimate.change(moves=tuple(moves)))
+    found = find_faults(moved(estimate, lambda x: 0.1 * max(0.0, x)))
     assert max(found, key=lambda name: found[name].log_odds) == TRACKER
+    assert found[TRACKER].log_odds > 4.0
 
 
 def test_what_the_tracker_alone_says_against_the_model_is_no_fault_of_it():
     estimate, _ = followed()
-    alone = estimate.change(along=(), quantities=(), along_curves=())
+    depth = float(estimate.tips[-1, 0])
+    alone = moved(estimate, lambda x: 1.0 * (x > depth - 4.0)).change(
+        along=(), quantities=(), along_curves=()
+    )
     assert find_faults(alone)[TRACKER].log_odds <= 0.0
+
+
+def test_the_odds_are_those_of_the_readings_whatever_the_fit_took_for_an_offset():
+    estimate, _ = followed()
+    offset = estimate.along[0].slots.offset
+    other = estimate.parameters.copy()
+    other[offset] += 2.0 * estimate.along[0].sensor.offset_sd
+    known, found = find_faults(estimate), find_faults(estimate.simulate_with(other))
+    for name, one in known.items():
+        assert found[name].log_odds == pytest.approx(one.log_odds, abs=0.02)
+
+
+def test_what_a_declared_field_explains_is_no_fault():
+    estimate, _ = followed()
+    grown = moved(estimate, lambda x: 0.1 * max(0.0, x))
+    declared = find_faults(grown.with_field(2.0, 0.0))[TRACKER]
+    assert declared.log_odds < 1.0 < 4.0 < find_faults(grown)[TRACKER].log_odds
+
+
+def test_what_the_error_of_the_model_explains_is_no_fault(monkeypatch):
+    estimate, _ = followed()
+    wrong = drifted(estimate, "fbg", float(estimate.tips[-1, 0]) - 9.0, 0.3)
+    known = find_faults(wrong)["fbg"].log_odds
+    kind = type(wrong.along[0].sensor)
+    plain = kind.model_error
+    monkeypatch.setattr(kind, "model_error", lambda sensor, values: 10.0 * plain(sensor, values))
+    assert find_faults(wrong)["fbg"].log_odds < 0.3 * known
