@@ -162,7 +162,7 @@ class Control(_Columns):
 
     @property
     def rolls(self) -> bool:
-        """Whether the needle is rolled, before or during the step."""
+        """True if the needle is rolled, before or during the step."""
         return self.roll != 0.0 or self.spin != 0.0
 
 
@@ -402,7 +402,7 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """Whether the check passed."""
+        """True if the check passed."""
         return self.kind is VerdictKind.OK
 
     def __str__(self) -> str:

@@ -49,7 +49,7 @@ class Observation:
 
     @property
     def sensed(self) -> bool:
-        """Whether a sensor along the needle has a good reading of this period that corrects the estimate."""
+        """True if a sensor along the needle has a good reading of this period that corrects the estimate."""
         return bool(self._sensor_times)
 
     @property

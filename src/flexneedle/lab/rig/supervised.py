@@ -206,7 +206,7 @@ class SupervisedRig(RigSource):
 
     @property
     def moves(self) -> bool:
-        """Whether motors move."""
+        """True while motors move."""
         return not self.dry_run
 
     def check(self, scenario: Scenario, strategy: str) -> None:

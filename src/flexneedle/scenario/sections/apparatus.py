@@ -70,7 +70,7 @@ class Setup(Section):
 
     @property
     def half_turns(self) -> bool:
-        """Whether the needle rolls by half turns only."""
+        """True if the needle rolls by half turns only."""
         return self.axes == 1 or self.rotation == "half-turns"
 
     @property
@@ -92,7 +92,7 @@ class Setup(Section):
 
     @property
     def has_guide(self) -> bool:
-        """Whether a guide supports the needle before the skin."""
+        """True if a guide supports the needle before the skin."""
         return self.guide_to_skin_mm is not None
 
     @property
@@ -167,7 +167,7 @@ class Entry(Section):
 
     @property
     def free(self) -> bool:
-        """Whether the planner chooses point or slope."""
+        """True if the planner chooses point or slope."""
         return self.free_radius_mm > 0.0 or self.free_slope_mrad > 0.0
 
     @property

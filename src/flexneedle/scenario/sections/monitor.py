@@ -11,7 +11,7 @@ class MonitorSettings(Section):
     """Section `monitor`: limits beyond which the needle is held. `indicator_limit` is from the paper, section IV-B."""
 
     enabled: bool = True
-    """Whether the checks of this section run. Missing, stale and improbable readings are always rejected."""
+    """True: the checks of this section run. Missing, stale and improbable readings are always rejected."""
     indicator_limit: Positive = 0.0547
     """Limit of a reference's indicator, the relative error of its coils' distance. Above it the field is
     distorted."""

@@ -60,7 +60,7 @@ class DrivenNeedle:
 
     @property
     def converged(self) -> bool:
-        """Whether all steps converged to an equilibrium."""
+        """True if all steps converged to an equilibrium."""
         return self._plant.converged
 
 

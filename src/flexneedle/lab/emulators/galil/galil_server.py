@@ -198,7 +198,7 @@ class TcpServer:
 
     @property
     def is_plugged(self) -> bool:
-        """Whether it listens."""
+        """True while it listens."""
         return self._listening is not None
 
     def plug(self) -> None:
