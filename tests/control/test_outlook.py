@@ -18,12 +18,17 @@ GRID = np.arange(-30.0, 60.0)
 
 def linear(precision, curves, now=0.0, variance=1e-3):
     """Outlook and estimate of a linear problem: the tip is the sum of the parameters times their curves (K, g)."""
-    setup = SimpleNamespace(max_advance_mm=1.0)
+    scenario = SimpleNamespace(
+        setup=SimpleNamespace(max_advance_mm=1.0), tracker=SimpleNamespace(field_length_mm=20.0)
+    )
     estimate = SimpleNamespace(
         tracked=True,
         precision=np.asarray(precision),
         reading_variance=variance,
-        nominal=SimpleNamespace(scenario=SimpleNamespace(setup=setup)),
+        lasting_variance=0.0,
+        field_sd=0.0,
+        slots=SimpleNamespace(bias=slice(0, 0)),
+        nominal=SimpleNamespace(scenario=scenario),
         state=SimpleNamespace(tip=np.array([now, 0.0, 0.0, 0.0, 0.0])),
         axes=1,
     )
@@ -46,13 +51,22 @@ def floor(estimate):
 
 @pytest.mark.parametrize("now", [-20.0, 5.0, 25.0, 34.0])
 @pytest.mark.parametrize("variance", [1e-4, 1e-2, 0.3])
-def test_it_agrees_with_a_monte_carlo_of_a_linear_problem(now, variance):
-    """Draw parameters, readings up to the last correction, and the miss of a path to the estimated target then."""
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+def test_it_agrees_with_a_monte_carlo_of_a_linear_problem(now, variance, bias):
+    """Draw parameters, readings up to the last correction, and the miss of a path to the estimated target then.
+
+    bias: standard deviation of a constant error of the readings, a parameter that does not move the tip.
+    """
     precision, curves = two_parameters()
+    read = curves
+    if bias:
+        precision = np.diag([*np.diag(precision), bias**-2])
+        read, curves = (np.vstack([curves, level * np.ones(GRID.size)]) for level in (1.0, 0.0))
     outlook, estimate = linear(precision, curves, now, variance)
+    estimate.slots.bias = slice(2, 3) if bias else slice(0, 0)
     rng, n = np.random.default_rng(1), 20_000
-    truth = rng.multivariate_normal(np.zeros(2), np.linalg.inv(precision), n)
-    ahead = curves[:, (now < GRID) & (GRID <= TARGET - ol.UNCORRECTED)]
+    truth = rng.multivariate_normal(np.zeros(len(curves)), np.linalg.inv(precision), n)
+    ahead = read[:, (now < GRID) & (GRID <= TARGET - ol.UNCORRECTED)]
     readings = truth @ ahead + rng.normal(0.0, np.sqrt(variance), (n, ahead.shape[1]))
     gain = np.linalg.solve(precision + ahead @ ahead.T / variance, ahead / variance)
     estimated = readings @ gain.T
@@ -81,6 +95,13 @@ def test_after_the_last_correction_the_uncertainty_stays():
     end = curves[:, GRID == TARGET].ravel()
     expected = np.sqrt(end @ np.linalg.inv(precision) @ end + floor(estimate) ** 2)
     assert outlook.sd_to_come(estimate, TARGET) == pytest.approx(expected)
+
+
+def test_readings_know_an_error_of_the_field_no_better_than_it_is():
+    """An unknown offset, after as many steps as the field's error lasts."""
+    outlook, estimate = linear([[0.01**2]], np.ones((1, GRID.size)), now=0.0)
+    estimate.field_sd = 0.5
+    assert outlook.sd_after(estimate, TARGET, np.array([20.0]))[0] == pytest.approx(0.5, rel=0.01)
 
 
 @given(

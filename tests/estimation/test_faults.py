@@ -85,6 +85,14 @@ def test_what_the_tracker_alone_says_against_the_model_is_no_fault_of_it():
     assert find_faults(alone)[TRACKER].log_odds <= 0.0
 
 
+def test_a_leap_that_the_tracker_shows_is_no_fault_of_another_sensor():
+    """Without this the odds for the points are 7."""
+    estimate, _ = followed()
+    depth = float(estimate.tips[-1, 0])
+    found = find_faults(moved(estimate, lambda x: 0.8 * (x > depth - 4.0)))
+    assert max(found[one.name].log_odds for one in estimate.along) < 1.0
+
+
 def test_the_odds_are_those_of_the_readings_whatever_the_fit_took_for_an_offset():
     estimate, _ = followed()
     offset = estimate.along[0].slots.offset

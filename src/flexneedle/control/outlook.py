@@ -92,15 +92,24 @@ class Outlook:
         """Return the standard deviation (mm), on an axis, of the miss after all corrections, by the linear model."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         known = float(self.sd_after(estimate, target, np.array([target - UNCORRECTED * step]))[0]) ** 2
-        known += _UNEXPLAINED**2 * estimate.reading_variance
+        known += _UNEXPLAINED**2 * estimate.reading_variance + estimate.lasting_variance
         known += (_DRIFT * (target - float(estimate.state.tip[X]))) ** 2
         return float(np.sqrt(known))
 
     def sd_after(self, estimate: Identified, target: float, depths: Floats) -> Floats:
-        """Return standard deviations (d,), mm, on an axis, of the end if uncorrected, after readings down to depths."""
-        end, to_come = self.at(target), self.grid > estimate.state.tip[X]
-        slopes = np.where((to_come & (self.grid <= depths[:, None]))[:, None], self.curves, 0.0)
-        variance = estimate.reading_variance if estimate.tracked else np.inf
+        """Return standard deviations (d,), mm, on an axis, of the end if uncorrected, after readings down to depths.
+
+        Of the tracker: its constant error stays unknown. The error of its field is noise whose mean over as many steps
+        as it lasts has its full size.
+        """
+        end, to_come, read = self.at(target), self.grid > estimate.state.tip[X], self.curves
+        if estimate.slots.bias.stop:
+            read = read.copy()
+            read[estimate.slots.bias] = directions(1.0, estimate.axes)[:, None]
+        slopes = np.where((to_come & (self.grid <= depths[:, None]))[:, None], read, 0.0)
+        scenario = estimate.nominal.scenario
+        steps = max(1.0, scenario.tracker.field_length_mm / scenario.setup.max_advance_mm)
+        variance = estimate.reading_variance + steps * estimate.field_sd**2 if estimate.tracked else np.inf
         then = estimate.precision + (slopes @ slopes.conj().swapaxes(1, 2)).real / variance
         sd: Floats = np.sqrt((np.linalg.solve(then, end[:, None])[..., 0] @ end.conj()).real / estimate.axes)
         return sd

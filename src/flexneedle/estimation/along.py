@@ -6,7 +6,7 @@ offset turns instead.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -179,16 +179,22 @@ class SensorFit:
             index[first], total(part) / number, mean, count, total(facing) / number, total(time) / number
         )
 
-    def quantities(self, poses: Floats, length: float) -> Floats:
-        """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm).
+    def values(self, poses: Floats, length: float) -> Floats:
+        """Return the values (…, d) of an error-free sensor on poses (…, n, 5) of needles, by their length (mm)."""
+        return self._of_each(poses, length, lambda needles: predict_values(self.sensor, needles, self.axes))
 
-        Their derivatives to its places follow: (…, d, 1 + p).
-        """
+    def quantities(self, poses: Floats, length: float) -> Floats:
+        """Return `values`, followed by their derivatives to the places of the sensor: (…, d, 1 + p)."""
+        values = self.values(poses, length)[..., None]
+        if not self.sensor.place_sds:
+            return values
+        slopes = self._of_each(poses, length, lambda needles: self.sensor.slopes(needles, self.axes))
+        return np.concatenate([values, slopes], axis=-1)
+
+    @staticmethod
+    def _of_each(poses: Floats, length: float, compute: Callable[[Needles], Floats]) -> Floats:
         flat = poses.reshape(-1, *poses.shape[-2:])
-        needles = Needles(flat, length / (flat.shape[1] - 1))
-        found = predict_values(self.sensor, needles, self.axes)[:, :, None]
-        if self.sensor.place_sds:
-            found = np.concatenate([found, self.sensor.slopes(needles, self.axes)], axis=2)
+        found = compute(Needles(flat, length / (flat.shape[1] - 1)))
         return found.reshape(*poses.shape[:-2], *found.shape[1:])
 
     def placed(self, ends: Floats, parameters: Floats) -> Floats:

@@ -5,8 +5,8 @@ odds are the logarithm of its Bayes factor, of readings with and without it, by 
 the generalised likelihood ratio for a change of unknown time (Willsky and Jones, IEEE Trans. Autom. Control 21:108,
 1976), with a prior on the size of the change.
 
-After a leap of the needle the model is late. So the tracker's own evidence against the model is no evidence of its
-fault and is subtracted, as is the evidence of a sensor beside which no other measures.
+After a leap of the needle the model is late. So the evidence of the tracker alone, or else
+of a sensor alone, against the model is no evidence of a fault, and is subtracted.
 
 The model's error lasts over some moves, and is correlated as e^(−moves/length). Readings are averaged over this
 number of moves, the last ones over fewer.
@@ -78,10 +78,14 @@ def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
         tip = rows[TRACKER]
         own = places[TRACKER]
         covariance[own, own] += _is_same(tip.value) * (tip.shares @ field_covariance(fitted) @ tip.shares.T)
-    common = _compute_all(fitted, rows, places, left, covariance + error, single=False)
+    leap = 0.0
+    if TRACKER in rows:
+        leap = _find_alone(fitted, TRACKER, rows, places, left, covariance + error)
+    common = _compute_all(fitted, rows, places, left, covariance + error, leap, single=False)
     if all(one.is_common for one in rows.values()):
         return common
-    single = _compute_all(fitted, rows, places, left, covariance + _DOUBT**2 * error, single=True)
+    doubted = covariance + _DOUBT**2 * error
+    single = _compute_all(fitted, rows, places, left, doubted, leap, single=True)
     return common | {name: max(common[name], one) for name, one in single.items()}
 
 
@@ -91,10 +95,14 @@ def _compute_all(
     places: Mapping[str, slice],
     left: Floats,
     covariance: Floats,
+    leap: float,
     *,
     single: bool,
 ) -> dict[str, Fault]:
-    """Return the likeliest faults, of single values or of all together; of residuals (n,) with this covariance."""
+    """Return the likeliest faults, of single values or of all together; of residuals (n,) with this covariance.
+
+    leap: log odds of a fault by the tracker's readings alone.
+    """
     precision = np.linalg.inv(covariance).astype(np.float64)
     weighted, depth = precision @ left, float(fitted.tips[-1, X])
     found = {}
@@ -103,13 +111,29 @@ def _compute_all(
             continue
         own, size = places[name], _size(fitted, name)
         value = one.value if single else one.value % one.across
-        found[name] = _find_fault(one.depth, value, weighted[own], precision[own, own], size, depth)
+        likeliest = _find_fault(one.depth, value, weighted[own], precision[own, own], size, depth)
         others = [other.depth.max() for key, other in rows.items() if key != name]
-        if name == TRACKER or max(others, default=-np.inf) < depth - _BESIDE_MM:
-            alone = np.linalg.inv(covariance[own, own]).astype(np.float64)
-            by_itself = _find_fault(one.depth, value, alone @ left[own], alone, size, depth)
-            found[name] = found[name]._replace(log_odds=found[name].log_odds - max(0.0, by_itself.log_odds))
+        surprise = leap
+        if name != TRACKER and max(others, default=-np.inf) < depth - _BESIDE_MM:
+            surprise = _find_alone(fitted, name, rows, places, left, covariance)
+        found[name] = likeliest._replace(log_odds=likeliest.log_odds - surprise)
     return found
+
+
+def _find_alone(
+    fitted: FittedInsertion,
+    name: str,
+    rows: Mapping[str, _Rows],
+    places: Mapping[str, slice],
+    left: Floats,
+    covariance: Floats,
+) -> float:
+    """Return the log odds of a fault of all values of a sensor together by its own readings, at least 0."""
+    one, own = rows[name], places[name]
+    precision = np.linalg.inv(covariance[own, own]).astype(np.float64)
+    size, depth = _size(fitted, name), float(fitted.tips[-1, X])
+    found = _find_fault(one.depth, one.value % one.across, precision @ left[own], precision, size, depth)
+    return max(0.0, found.log_odds)
 
 
 def _find_fault(

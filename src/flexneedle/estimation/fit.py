@@ -250,16 +250,18 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
             curve[:] = np.interp(fitted.grid, depth, change / steps[k])
     along_curves = fitted.along_curves
     if fitted.along and needles.begun:
-        whole = fitted.quantities_of(np.concatenate([shapes, further.shapes], axis=1))
+        length = fitted.nominal.scenario.needle.length_mm
+        whole = np.concatenate([shapes, further.shapes], axis=1)
+        values = (one.values(whole, length) for one in fitted.along)
         along_curves = tuple(
             _renew(
                 old,
                 needles.begun,
-                (each[1:, ..., 0] - each[0, ..., 0]) / fitted.prior.steps[needles.begun, None, None],
+                (each[1:] - each[0]) / fitted.prior.steps[needles.begun, None, None],
                 depth,
                 fitted.grid,
             )
-            for old, each in zip(along_curves, whole, strict=True)
+            for old, each in zip(along_curves, values, strict=True)
         )
     reached = zip(needles.begun, models[1:], states[1:], strict=True)
     perturbed = (

@@ -272,12 +272,23 @@ class Identified(FittedInsertion):
         parts = np.stack([slope.real, slope.imag])
         covariance = np.zeros((3, 3))
         covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
+        covariance[1:, 1:] = parts @ self.covariance @ parts.T + self._lasting
+        return covariance
+
+    @cached_property
+    def _lasting(self) -> Floats:
+        """Covariance (2, 2) of the tip's y and z (mm²) by the errors of the model that last."""
+        slope = self._tip_slope
         model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
         left = model**2 * (1.0 - math.exp(-2.0 * self._age_of_residual / LASTING))
-        gains = parts @ self.covariance
-        covariance[1:, 1:] = gains @ parts.T + lasting_covariance(self, gains)
-        covariance[1:, 1:] += left * np.diag([1.0, self.axes - 1.0])
-        return covariance
+        gains = np.stack([slope.real, slope.imag]) @ self.covariance
+        lasting: Floats = lasting_covariance(self, gains) + left * np.diag([1.0, self.axes - 1.0])
+        return lasting
+
+    @property
+    def lasting_variance(self) -> float:
+        """Variance (mm²) of the tip's lateral position, on an axis, by the errors of the model that last."""
+        return float(np.trace(self._lasting)) / self.axes if self.along else 0.0
 
     @property
     def _age_of_residual(self) -> float:

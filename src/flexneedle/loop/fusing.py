@@ -25,6 +25,7 @@ from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, Verdict
 _FAULTY = 9.0  # log odds (natural) of a fault of a sensor, from which it is excluded
 _IN_DOUBT = 3.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
 _CLEAR = 3.0  # by which a fault must be likelier than another
+_MOVES = 2  # after which faults are searched again: the newest readings are averaged over two
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Watch:
     """The monitors of the tracker and of the sensors along the needle, by name."""
 
     monitors: Mapping[str, SensorMonitor] = field(default_factory=dict)
+    judged: int = 0  # number of moves when nothing was in doubt
 
     def of(self, name: str) -> SensorMonitor:
         """Return the monitor of a sensor."""
@@ -39,7 +41,7 @@ class Watch:
 
     def change(self, name: str, monitor: SensorMonitor) -> "Watch":
         """Return the watch with another state of a monitor."""
-        return Watch({**self.monitors, name: monitor})
+        return replace(self, monitors={**self.monitors, name: monitor})
 
 
 _NEW = SensorMonitor()
@@ -119,10 +121,13 @@ def exclude_faulty(
         if not one.verdict.ok and before.of(one.name).excluded.ok:  # frozen
             since = _time_of_depth(estimate, min(depth, watch.of(one.name).since))
             return estimate.without(one.name, since), watch, tuple(states), OK
+    if len(estimate.moves) - watch.judged < _MOVES:
+        return estimate, watch, tuple(states), OK
     faults = {name: one for name, one in estimate.faults().items() if watch.of(name).excluded.ok}
     faulty, verdict = judge_faults(faults)
     if not faulty:
-        return estimate, watch, tuple(states), verdict
+        judged = len(estimate.moves) if verdict.ok else watch.judged
+        return estimate, replace(watch, judged=judged), tuple(states), verdict
     watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
     if faulty == TRACKER:
         return estimate, watch, tuple(states), verdict

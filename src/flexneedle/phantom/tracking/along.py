@@ -1,6 +1,7 @@
 """Virtual sensors along the needle, on the true needle, with errors that the observer does not know."""
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -76,24 +77,28 @@ class VirtualSensor:
     def read(self) -> tuple[Reading, ...]:
         """Return the readings that arrived since the last call, oldest first."""
         period, now = 1.0 / self._sensor.rate_hz, self._phantom.now()
-        found: list[Reading] = []
+        taken: list[tuple[float, Fault | None, float]] = []
         while True:
             time = (self._taken + 1) * period
             fault = self._fault_at(time)
             late = fault.size if fault and fault.kind == "delayed" else 0.0
             if time + self._sensor.delay_s + late > now + 1e-9:
-                return tuple(found)
+                break
             self._taken += 1
             self._lost = fault is not None and fault.kind == "lost"
             if not self._lost:
-                found.append(self._measure(time, fault, time + self._clock + late))
+                taken.append((time, fault, time + self._clock + late))
+        if not taken:
+            return ()
+        levels = self._values([time for time, *_ in taken])
+        return tuple(self._measure(level, *one) for level, one in zip(levels, taken, strict=True))
 
     def _fault_at(self, time: float) -> Fault | None:
         """Return the fault, if it has begun."""
         fault = self._sensor.phantom.fault
         return fault if fault and self._phantom.tip_at(time)[X] >= fault.depth_mm else None
 
-    def _measure(self, time: float, fault: Fault | None, stamp: float) -> Reading:
+    def _measure(self, level: Floats, time: float, fault: Fault | None, stamp: float) -> Reading:
         errors, sensor = self._sensor.phantom, self._sensor
         noise = self._rng.normal(0.0, sensor.noise, self._offset.size)
         chance, outlying, side = self._rng.random(3).tolist()
@@ -102,7 +107,7 @@ class VirtualSensor:
             return Reading(stamp, self._last)
         if chance < errors.missing_fraction:
             return Reading(stamp, (), "missing")
-        values = self._values(time) + noise + sensor.wander_sd * self._wander
+        values = level + noise + sensor.wander_sd * self._wander
         if fault and fault.kind == "drift":
             gone = self._phantom.tip_at(time)[X] - fault.depth_mm
             values += fault.size * sensor.noise * gone * np.tile(self._faulty_way, values.size)[: values.size]
@@ -117,14 +122,15 @@ class VirtualSensor:
         fresh = self._rng.normal(0.0, math.sqrt(1.0 - kept**2), self._wander.size)
         self._wander = kept * self._wander + fresh
 
-    def _values(self, time: float) -> Floats:
-        """Return the values (d,) at a time without noise, NaN where the sensor does not see the needle."""
-        poses, roll = self._phantom.shape_at(time)
-        needle = Needles(poses[None], self._length / (len(poses) - 1))
-        seen = self._mounted.sees(needle, self._axes)[0]
-        level = self._gain * predict_values(self._mounted, needle, self._axes)
-        angle = self._turn - (roll if self._sensor.rolls else 0.0)
-        if angle and self._sensor.paired:
-            level = turn(level, np.exp(1j * angle), self._axes)
-        grown = max(0.0, poses[-1, X]) / self._depth * self._drift
-        return np.where(seen, level[0] + self._offset + grown, np.nan)
+    def _values(self, times: Sequence[float]) -> Floats:
+        """Return the values (r, d) at times (r,) without noise, NaN where the sensor does not see the needle."""
+        shapes, rolls = zip(*(self._phantom.shape_at(time) for time in times), strict=True)
+        poses = np.stack(shapes)
+        needles = Needles(poses, self._length / (poses.shape[1] - 1))
+        seen = self._mounted.sees(needles, self._axes)
+        level = self._gain * predict_values(self._mounted, needles, self._axes)
+        if self._sensor.paired:
+            angles = self._turn - (np.array(rolls) if self._sensor.rolls else np.zeros(len(times)))
+            level = turn(level, np.exp(1j * angles), self._axes)
+        grown = np.maximum(0.0, poses[:, -1, X]) / self._depth
+        return np.where(seen, level + self._offset + np.multiply.outer(grown, self._drift), np.nan)

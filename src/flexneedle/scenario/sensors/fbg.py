@@ -93,7 +93,8 @@ class Fbg(KeyedSensor):
         """Return the mean curvatures (m, d), 1/mm, over the gauges."""
         far = np.array(self.sites_mm) + 0.5 * self.gauge_mm
         near = np.maximum(0.0, far - self.gauge_mm)  # the tip ends the last gauge
-        bent = (tilts_at(needles, near) - tilts_at(needles, far))[..., :axes] / (far - near)[:, None]
+        tilts = tilts_at(needles, np.append(near, far))[..., :axes]
+        bent = (tilts[:, : near.size] - tilts[:, near.size :]) / (far - near)[:, None]
         return bent.reshape(len(bent), -1)
 
     def slopes(self, needles: Needles, axes: int) -> "Floats":

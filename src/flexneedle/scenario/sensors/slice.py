@@ -66,22 +66,24 @@ class Slice(KeyedSensor):
         across /= np.linalg.norm(across)
         return np.array([normal, across, np.cross(normal, across)])
 
-    def _in_frame(self, points: "Floats") -> tuple["Floats", "Floats"]:
-        """Return the distance (…) of points (…, 3) from the plane, and their coordinates (…, 2) in it."""
+    def _in_frame(self, points: "Floats", count: int = 3) -> "Floats":
+        """Return the first coordinates (…, count) of points (…, 3): the distance from the plane, and two in it."""
         frame = self.frame
         if any(self._turn):
             frame = frame + np.cross(self._turn, frame)  # of a small rotation
-        places = (points - [self.plane_mm, 0.0, 0.0] - self._shift) @ frame.T
-        return places[..., 0], places[..., 1:]
+        origin = [self.plane_mm + self._shift[0], *self._shift[1:]]
+        found: Floats = points @ frame[:count].T - frame[:count] @ origin
+        return found
 
     def predict(self, needles: Needles, axes: int) -> "Floats":
         """Return the coordinates (m, axes), mm, of the crossing in the plane."""
-        along, across = self._in_frame(needles.points)
-        return cross(along, across[..., :axes], np.zeros(1))[:, 0]
+        points = needles.points
+        crossing = cross(self._in_frame(points, 1)[..., 0], points, np.zeros(1))[:, 0]
+        return self._in_frame(crossing)[:, 1 : 1 + axes]
 
     def sees(self, needles: Needles, axes: int) -> "Flags":
         """Return flags (m, axes): True for needles that have passed the plane."""
-        return passed(self._in_frame(needles.points)[0], np.zeros(1), axes)
+        return passed(self._in_frame(needles.points, 1)[..., 0], np.zeros(1), axes)
 
     def model_error(self, values: "Floats") -> "Floats":
         """Return standard deviations (r, d), mm."""
@@ -96,7 +98,7 @@ class Slice(KeyedSensor):
             raise ValueError(
                 f"{len(reading.rows)} rows of {len(reading.rows[0])} numbers, expected one x, y, z"
             )
-        return self._in_frame(np.array(reading.rows[0]))[1][:axes]
+        return self._in_frame(np.array(reading.rows[0]))[1 : 1 + axes]
 
     def report(self, values: "Floats", axes: int) -> Matrix:
         """Return x, y, z (mm) of coordinates in the plane."""
