@@ -17,20 +17,26 @@ POINTS = {"kind": "points", "from_mm": -15.0, "to_mm": 30.0, "rate_hz": 10.0}
 ROLLS = {14: 0.7, 34: -1.9}
 
 
-def command(k):
-    """An advance with a moving guide, and rolls by odd angles."""
-    return Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), dg_z=0.08 * np.cos(0.2 * k), roll=ROLLS.get(k, 0.0))
+def command(k, turn):
+    """An advance with a moving guide, and turns by odd angles, before it or (spin) during it."""
+    more = {turn: ROLLS.get(k, 0.0)}
+    return Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), dg_z=0.08 * np.cos(0.2 * k), **more)
 
 
 @cache
-def followed(axes=2, count=50, **changes):
-    """An estimate that has followed a virtual needle with three sensors besides the tracker, and the rig."""
+def followed(axes=2, count=50, turn="roll", first=(), **changes):
+    """An estimate that has followed a virtual needle with three sensors besides the tracker, and the rig.
+
+    first: rolls (rad) at rest before the needle advances.
+    """
     name = {1: "phantom", 2: "phantom3d"}[axes]
     scenario = flexneedle.load_scenario(name).with_values({"sensor": [FBG, SLICE, POINTS], **changes})
     rig = virtual_rig(scenario, 0.0, Seeds.of(2))
     estimate = Identification().begin(begun_with(Simulator(scenario, threads=1)))
-    for k in range(count):
-        row = command(k) if axes == 2 else Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), flip=k in ROLLS)
+    rows = [command(k, turn) for k in range(count)]
+    if axes == 1:
+        rows = [Control(db_x=1.0, dg_y=0.1 * np.sin(0.3 * k), flip=k in ROLLS) for k in range(count)]
+    for row in (*(Control(roll=roll) for roll in first), *rows):
         estimate = estimate.move(rig.driver.apply(row, 0.2))
         along = {name: one.read() for name, one in rig.sensors.items()}
         good = {name: [one for one in readings if one.rows] for name, readings in along.items()}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexneedle.estimation.along import between, whiten
-from flexneedle.estimation.fit import differentiate, lasting_covariance, simulate_due
+from flexneedle.estimation.fit import differentiate, jacobian_of, lasting_covariance, simulate_due
 from flexneedle.estimation.fitted import LASTING
 from sensed import followed
 
@@ -40,9 +40,28 @@ def test_derivatives_are_those_of_simulations_with_other_parameters(axes, number
         assert np.abs(change - jacobian[:, :, k] * sd[k])[seen].max(initial=0.0) < 0.25 * scale, k
 
 
+def test_turns_in_air_have_derivatives_of_their_own():
+    """Of the natural bend, which turns with the needle: at one depth, before and after half a turn."""
+    first = (np.pi, 0.0, -np.pi, 0.0)
+    estimate, _ = followed(count=4, first=first, **{"tracker.bias_sd_mm": 1.0})
+    estimate = differentiate(estimate, simulate_due(estimate, estimate.parameters, range(estimate.slots.end)))
+    jacobian, bins, sd = estimate.along_jacobians[0], estimate.bins[0], estimate.prior.steps
+    seen = bins.count > 0.0
+    before, tip = expected(estimate, 0), estimate.residuals[0]
+    for k in range(estimate.slots.bend.start, estimate.slots.bend.stop):
+        shifted = estimate.simulate_with(estimate.parameters + sd[k] * (np.arange(sd.size) == k))
+        change = (expected(shifted, 0) - before) / sd[k]
+        np.testing.assert_allclose(change[seen], jacobian[:, :, k][seen], atol=0.1 * np.abs(change).max())
+        at_tip = (tip - shifted.residuals[0]) / sd[k]
+        still = ~estimate.readings[0].turns
+        np.testing.assert_allclose(
+            jacobian_of(estimate)[still, k], at_tip[still], atol=0.1 * np.abs(at_tip).max()
+        )
+
+
 def test_the_derivative_to_the_clock_is_that_of_readings_at_other_times():
-    """In moves whose readings stay in them; the needle rolls and bends between the ends of a move."""
-    estimate, _ = followed()
+    """In moves whose readings stay in them; the needle turns and bends between the ends of a move."""
+    estimate, _ = followed(turn="spin")
     one, ends, step = estimate.along[0], estimate.quantities[0], 1e-4
 
     def residual(clock):

@@ -38,13 +38,14 @@ class SensorSlots(NamedTuple):
 
 
 class Timeline(NamedTuple):
-    """Times (m,), s, of moves, and the needle's angle (rad): at their start, and its change (m,)."""
+    """Times (m,), s, of moves, the needle's angle (rad) at their start, its change, and which of them roll (m,)."""
 
     begun: Floats
     travel_begun: Floats
     ended: Floats
     angle: Floats
     turned: Floats
+    rolls: Flags
 
     @staticmethod
     def of(moves: Sequence[Move], roll: float) -> "Timeline":
@@ -57,7 +58,8 @@ class Timeline(NamedTuple):
         ).reshape(-1, 5)
         turned = rows[:, 3] + rows[:, 4]
         begun, travel_begun, ended = rows[:, :3].T
-        return Timeline(begun, travel_begun, ended, roll + np.cumsum(turned) - turned, turned)
+        angle = roll + np.cumsum(turned) - turned
+        return Timeline(begun, travel_begun, ended, angle, turned, rows[:, 3] != 0.0)
 
     def at(self, times: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
         """Return move, share of it done, and angle of the needle (r,), at times (r,)."""
@@ -170,8 +172,8 @@ class SensorFit:
         def total(rows: NDArray[Any]) -> NDArray[Any]:
             return np.add.reduceat(rows, first) if len(first) else rows
 
-        if self.sensor.rolls and self.axes == 1:  # between half turns it leaves the plane
-            seen &= line.turned[index][:, None] == 0.0
+        if self.sensor.rolls:  # between the ends of a roll its axes and the needle turn unevenly
+            seen &= ~line.rolls[index][:, None]
         number, count = total(np.ones(len(index))), total(seen.astype(float))
         level = np.where(seen, value, 0.0)
         mean = total(self._turned(level, facing)) / np.maximum(count, 1.0)

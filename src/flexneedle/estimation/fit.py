@@ -118,7 +118,7 @@ def jacobian_of(fitted: FittedInsertion) -> Laterals:
     """Return the derivative (r, K) of the predicted readings of all sensors, from the curves."""
     parts = []
     for k, (sensor, readings) in enumerate(zip(fitted.sensors, fitted.readings, strict=True)):
-        part = fitted.slopes(readings.between(fitted.tips[:, X]), k)
+        part = fitted.slopes(readings.between(fitted.places(fitted.tips[:, X])), k)
         offset = np.multiply.outer(readings.bevel, directions(1.0, fitted.axes))
         part[:, getattr(fitted.slots, sensor.offset)] = offset
         if k == 0 and fitted.slots.bias.stop:
@@ -242,7 +242,7 @@ def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
     rows = np.tile(ahead, (len(models), 1, 1))
     further = fitted.nominal.rollout(states, rows, models=models, limits=False, outputs=fitted.wanted)
     base, *moved = np.concatenate([tips, further.tips], axis=1)
-    depth, curves = np.maximum.accumulate(base[:, X]), fitted.curves.copy()
+    depth, curves = fitted.places(np.maximum.accumulate(base[:, X])), fitted.curves.copy()
     steps = fitted.prior.steps.tolist()
     for k, tip in zip(needles.begun, moved, strict=True):
         for curve, sensor in zip(curves[:, k], fitted.sensors, strict=True):

@@ -18,7 +18,7 @@ from flexneedle.estimation.sensors import Sensor, sensors_of
 from flexneedle.mechanics.model import Adaptation, Model, adapt, adapt_needle
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, STILL, THETA, Floats, Laterals, X, Y, Z, laterals
+from flexneedle.types import DB_X, ROLL, STILL, THETA, Floats, Laterals, X, Y, Z, laterals
 
 _REST = np.array([STILL])
 # An offset that turns with the bevel: error of its mean in a roll, whose motor starts and stops, relative to it.
@@ -181,26 +181,39 @@ class FittedInsertion:
                 bins,
                 ends,
                 self.depths(bins),
-                self.along_slopes(self.depths(bins), k),
+                self.along_slopes(between(bins, self.places(self.tips[:, X])[:, None])[:, 0], k),
                 self.parameters,
                 self.timeline,
             )
             for k, (one, bins, ends) in parts
         ]
 
+    def places(self, depth: Floats) -> Floats:
+        """Return the places (n,), mm, on the grid of the curves of needles at depths (n,): after the first moves.
+
+        These are the depths, but turns at rest before the first advance change the derivatives at one depth. So each
+        angle of the needle there has a place of its own, at the beginning of the grid, but the last.
+        """
+        still = np.logical_and.accumulate(self.rows[:, DB_X] == 0.0)
+        turned = np.cumsum(self.rows[still, ROLL] != 0.0)
+        before = np.flatnonzero(np.append(0, turned) < turned[-1]) if turned.size else []
+        places = depth.copy()
+        places[before] = self.grid[1 + np.append(0, turned)[before]]
+        return places
+
     def depths(self, bins: Bins) -> Floats:
         """Return the depths (b,), mm, of the tip at means of readings."""
         return between(bins, self.tips[:, X, None])[:, 0]
 
     def along_slopes(self, depth: Floats, sensor: int) -> Floats:
-        """Return derivatives (b, K, d) of the quantities of a sensor along the needle at depths (b,), mm."""
-        left, part = self._places(depth)
+        """Return derivatives (b, K, d) of the quantities of a sensor along the needle at places (b,), mm."""
+        left, part = self._nodes(depth)
         curves = self.along_curves[sensor]
         slopes = (1.0 - part)[:, None] * curves[:, left] + part[:, None] * curves[:, left + 1]
         return slopes.transpose(1, 0, 2)
 
-    def _places(self, depth: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """Return the points of the grid before depths (n,), mm, and the shares of the steps to the next."""
+    def _nodes(self, depth: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """Return the points of the grid before places (n,), mm, and the shares of the steps to the next."""
         step = self.grid[1] - self.grid[0]
         place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
         left = place.astype(int)
@@ -212,8 +225,8 @@ class FittedInsertion:
         return laterals(self.tips, THETA, self.axes)
 
     def slopes(self, depth: Floats, sensor: int = 0) -> Laterals:
-        """Return derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""
-        left, part = self._places(depth)
+        """Return derivatives (n, K) of a sensor's quantity at places (n,), mm, from the curves; 0 for its offset."""
+        left, part = self._nodes(depth)
         curves = self.curves[sensor]
         slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
         return slopes

@@ -88,9 +88,10 @@ class Identification:
         state, prior = simulator.start(task.plan.roll), Prior.of(scenario, settings, task.plan.target[0])
         prior, slots, along = add_sensors(prior, task)
         step = scenario.setup.max_advance_mm
-        grid = np.arange(
-            scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (ROUND + 6) * step, step
-        )
+        begin = scenario.setup.start_tip_x - 5 * step
+        if slots.bias.stop:  # room for the angles of the needle in air, whatever the start along the axis
+            begin -= 4.0 * scenario.control.start_axial_sd_mm
+        grid = np.arange(begin, scenario.setup.max_depth + (ROUND + 6) * step, step)
         length = scenario.needle.length_mm
         start = Identified(
             simulator,
@@ -282,7 +283,9 @@ class Identified(FittedInsertion):
         model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
         left = model**2 * (1.0 - math.exp(-2.0 * self._age_of_residual / LASTING))
         gains = np.stack([slope.real, slope.imag]) @ self.covariance
-        lasting: Floats = lasting_covariance(self, gains) + left * np.diag([1.0, self.axes - 1.0])
+        # Errors that cancel, since the needle was turned, are not subtracted: this is to first order only.
+        sizes, ways = np.linalg.eigh(lasting_covariance(self, gains))
+        lasting: Floats = (ways * np.maximum(sizes, 0.0)) @ ways.T + left * np.diag([1.0, self.axes - 1.0])
         return lasting
 
     @property

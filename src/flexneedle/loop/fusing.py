@@ -124,21 +124,19 @@ def exclude_faulty(
     if len(estimate.moves) - watch.judged < _MOVES:
         return estimate, watch, tuple(states), OK
     faults = {name: one for name, one in estimate.faults().items() if watch.of(name).excluded.ok}
-    faulty, verdict = judge_faults(faults)
-    if not faulty:
+    faulty, verdict = judge_faults(faults, _IN_DOUBT if estimate.tracked else _FAULTY)
+    if faulty in ("", TRACKER):
         judged = len(estimate.moves) if verdict.ok else watch.judged
         return estimate, replace(watch, judged=judged), tuple(states), verdict
     watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
-    if faulty == TRACKER:
-        return estimate, watch, tuple(states), verdict
     after = tuple(replace(one, verdict=verdict) if one.name == faulty else one for one in states)
     return estimate.without(faulty, _time_of_depth(estimate, faults[faulty].since)), watch, after, OK
 
 
-def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
+def judge_faults(faults: Mapping[str, Fault], in_doubt: float = _IN_DOUBT) -> tuple[str, Verdict]:
     """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
-    faults: the likeliest of each sensor by name.
+    faults: the likeliest of each sensor by name; in_doubt: limit of the tracker's log odds.
     """
     odds = {name: one.log_odds for name, one in faults.items()}
     tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
@@ -147,8 +145,8 @@ def judge_faults(faults: Mapping[str, Fault]) -> tuple[str, Verdict]:
         return name, Verdict(
             VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:.1f}"
         )
-    if tip > _IN_DOUBT and most - tip < _CLEAR:
-        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {_IN_DOUBT:.1f}"
+    if tip > in_doubt and most - tip < _CLEAR:
+        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {in_doubt:.1f}"
         if tip - most > _CLEAR:
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
         return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")

@@ -109,13 +109,10 @@ def observe_all(
         used = sensors if scenario.control.essential_points else ()
         found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, used)
         return replace(found, watch=watch, sensors=sensors)
-    trusted = watch.of(TRACKER).excluded.ok
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
     heard = (one.measurement.time for one in found.readings if one.verdict.ok)
     watch = watch.change(TRACKER, watch.of(TRACKER).hear(heard))
     estimate, watch, sensors, verdict = exclude_faulty(found.estimate, watch, sensors, before.watch)
-    if not trusted:
-        verdict = watch.of(TRACKER).excluded
     if verdict.ok:
         verdict = check_silent(scenario, watch, now)
     if verdict.ok:

@@ -1,6 +1,5 @@
 """A virtual phantom with the ports of a rig: a `Driver` and a `Clock`, and the true state for the record."""
 
-import cmath
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
-from flexneedle.phantom.shapes import ShapeHistory
+from flexneedle.phantom.shapes import ARC, ShapeHistory, of_arc
 from flexneedle.phantom.spring_back import SpringBack
 from flexneedle.simulator.control import MOVES, Limits, limit_half_turn, roll_time
 from flexneedle.types import (
@@ -36,7 +35,6 @@ from flexneedle.types import (
 )
 
 _LENGTHS = [DB_X, DB_Y, DB_Z, DG_Y, DG_Z]
-_ARC = 8  # parts of the tip's path in a roll
 _WHOLE = 1e-8  # of a motor step: tolerance for a position on a whole step
 
 
@@ -86,6 +84,7 @@ class Phantom:
         """Wait with the needle at rest."""
         if self._truth.spring_back > 0.0:
             self._step(np.array(STILL), self._time)
+            self._keep_shape(self._time)
         self._time += seconds
         self._path.append((self._time, *self._tip().tolist()))
         self._keep_shape(self._time)
@@ -109,6 +108,7 @@ class Phantom:
             part = row / parts
             part[ROLL] = 0.0
             self._step(part, turned + duration * (k + 1) / parts)
+            self._keep_shape(turned + duration * (k + 1) / parts)
         self._moved += row[:MOVES]
         self._rolled += float(row[ROLL] + row[SPIN])
         self._time = turned + duration
@@ -146,10 +146,12 @@ class Phantom:
         row[ROLL] = roll
         self._step(row, ended)
         after, before = self._path.pop()[1:], self._path[-1][1:]
-        for k in range(1, _ARC + 1):
-            part = k / _ARC
+        for k in range(1, ARC + 1):
+            part = k / ARC
             share = of_arc(roll, part) if setup.axes == 2 else of_arc(roll, part).real
             self._path.append((begun + part * (ended - begun), *_between(before, after, part, share)))
+        if self._keeps_shapes:
+            self._shapes.add_turn(begun, ended, roll, poses_of(self._plant), flat=setup.axes == 1)
         return ended
 
     def _step(self, row: Floats, time: float) -> None:
@@ -158,7 +160,6 @@ class Phantom:
             self._plant.step(part)
             self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
         self._path.append((time, *self._tip().tolist()))
-        self._keep_shape(time)
 
     def _keep_shape(self, time: float) -> None:
         if self._keeps_shapes:
@@ -203,12 +204,6 @@ def _between(before: Sequence[float], after: Sequence[float], part: float, share
         for k in (Y, THETA)
     )
     return [x, *(value for one in lateral for value in (one.real, one.imag))]
-
-
-def of_arc(roll: float, part: float) -> complex:
-    """Return the share of the chord, as a lateral quantity, at a part of an arc by `roll` (rad)."""
-    whole = cmath.exp(1j * roll) - 1.0
-    return (cmath.exp(1j * roll * part) - 1.0) / whole if abs(whole) > _WHOLE else complex(part)
 
 
 def poses_of(plant: Plant) -> Floats:

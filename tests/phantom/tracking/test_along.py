@@ -37,6 +37,23 @@ def test_without_errors_it_measures_the_curvature_of_the_true_needle_in_the_fram
     assert rig.clock.shape_at(readings[-1].time)[1] == pytest.approx(0.8, abs=0.02)
 
 
+def test_a_natural_bend_turns_with_the_needle_through_half_a_turn():
+    """In air, without other errors: the curvature in the needle's frame is the same throughout."""
+    errors = {"site_mm": 0.0, "missing_fraction": 0.0}
+    straight = {"start_offset_sd_mm": 0.0, "start_angle_sd_mrad": 0.0, "guide_clearance_mm": 0.0}
+    straight = {f"phantom.{key}": value for key, value in straight.items()}
+    scenario = flexneedle.load_scenario("phantom3d").with_values(
+        {"sensor": [{**SITES, "phantom": errors}], "phantom.initial_bend_mm": 1.0, **straight}
+    )
+    rig = virtual_rig(scenario, 0.0, Seeds.of(3))
+    rig.sensors["fbg"].read()
+    rig.driver.apply(flexneedle.Control(roll=np.pi), 0.2)
+    rows = np.array([one.rows for one in rig.sensors["fbg"].read()])
+    assert len(rows) > 40
+    assert np.hypot(*rows[0].T).max() > 1e-5
+    np.testing.assert_allclose(rows, np.broadcast_to(rows[0], rows.shape), atol=0.02 * np.abs(rows[0]).max())
+
+
 def test_it_arrives_late_by_its_delay_at_its_rate():
     readings, rig, scenario = driven()
     sensor = scenario.sensor[0]
