@@ -195,10 +195,10 @@ class FittedInsertion:
         angle of the needle there has a place of its own, at the beginning of the grid, but the last.
         """
         still = np.logical_and.accumulate(self.rows[:, DB_X] == 0.0)
-        turned = np.cumsum(self.rows[still, ROLL] != 0.0)
-        before = np.flatnonzero(np.append(0, turned) < turned[-1]) if turned.size else []
+        turned = np.append(0, np.cumsum(self.rows[still, ROLL] != 0.0))
+        before = np.flatnonzero(turned < turned[-1])
         places = depth.copy()
-        places[before] = self.grid[1 + np.append(0, turned)[before]]
+        places[before] = self.grid[1 + turned[before]]
         return places
 
     def depths(self, bins: Bins) -> Floats:
