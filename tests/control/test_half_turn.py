@@ -10,7 +10,7 @@ import flexneedle
 from adaptive import ADAPTIVE, PHANTOM
 from flexneedle.control.controllers import adaptive_mpc
 from flexneedle.estimation.identification import Identification
-from flexneedle.simulator.control import Limits
+from flexneedle.simulator.control import Limits, limit_half_turn
 from flexneedle.simulator.simulator import Simulator
 from synthetic import make_plan
 from tasks import task_of
@@ -28,13 +28,20 @@ def test_the_needle_returns_and_keeps_its_limits(changes, roll):
     roll = 0.0 if scenario.setup.half_turns else roll
     plan = replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=scenario, roll=roll)
     task = task_of(Simulator(scenario, threads=1), plan)
-    memory = ADAPTIVE.begin(task)
-    steps = [adaptive_mpc._turn_in_air(task, replace(memory, turns=k)) for k in range(4)]
-    turns = np.array([one.command for one in steps])
-    Limits.of(scenario).check(np.zeros(7), turns, roll)
-    assert [abs(one.command.roll) for one in steps] == pytest.approx([math.pi, 0.0, math.pi, 0.0])
-    assert sum(one.command.roll for one in steps) == pytest.approx(0.0)
-    assert [one.rest > 0.0 for one in steps] == [False, True, False, True]
+    memory, angle, steps = ADAPTIVE.begin(task), roll, []
+    while memory.turns < 2:
+        decision, memory = adaptive_mpc._turn_in_air(task, memory, angle)
+        Limits.of(scenario).check(np.zeros(7), np.array([decision.command]), angle)
+        turn = decision.command.roll
+        if scenario.setup.half_turns:
+            angle += limit_half_turn(angle, turn)
+        elif steps:  # the first is not carried out
+            angle += turn
+        steps.append(decision)
+    turns = [abs(one.command.roll) for one in steps if one.command.roll]
+    assert turns == pytest.approx([math.pi] * (2 if scenario.setup.half_turns else 3))
+    assert angle == pytest.approx(roll)
+    assert sum(one.rest > 0.0 for one in steps) == 2
 
 
 def test_the_error_of_the_tracker_is_known_before_the_needle_advances():

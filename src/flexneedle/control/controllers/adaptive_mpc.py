@@ -68,8 +68,9 @@ _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the be
 _PRICE_OF_ENERGY = 2.0
 # Intrusion into a margin up to which it is charged little: the estimate moves by about as much from period to period.
 _SOFT_MM = 0.1
-_TURNS = 4  # steps of the half turn in air: there, rest, back, rest
-_READINGS = 20  # of each rest
+_TURNS = 2  # ends of the half turn in air
+_READINGS = 20  # at each end
+_REACHED = math.radians(1.0)
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -120,7 +121,7 @@ class Memory:
     outlook: Outlook | None = None
     lever: Lever | None = None
     rests: int = 0  # number of rests already made
-    turns: int = 0  # steps of the half turn in air that are done
+    turns: int = 0  # ends of the half turn in air that are reached
 
 
 def begin(task: Task) -> Memory:
@@ -141,7 +142,7 @@ def decide(
 
     fitted = cast(Identified, estimate)  # CONTROLLER below names its observer
     if fitted.slots.bias.stop and memory.turns < _TURNS and float(fitted.tips[-1, X]) < 0.0:
-        return _turn_in_air(task, memory), replace(memory, turns=memory.turns + 1)
+        return _turn_in_air(task, memory, fitted.state.roll)
     settings = task.settings
     current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled
     ahead = Ahead.of(task, fitted.state, current)
@@ -170,16 +171,19 @@ def decide(
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples, doubt), after
 
 
-def _turn_in_air(task: Task, memory: Memory) -> Decision:
-    """Return the next step of half a turn in air, there and back.
+def _turn_in_air(task: Task, memory: Memory, roll: float) -> tuple[Decision, Memory]:
+    """Return the next step of half a turn in air, there and back, with a rest at either end; roll: the angle now (rad).
 
-    It separates a constant error of the tracker from the run-out, which turns with the needle.
+    It separates a constant error of the tracker from the run-out, which turns with the needle. A turn that was not
+    carried out is repeated.
     """
-    setup, roll = task.scenario.setup, task.plan.roll
-    there = math.copysign(min(math.pi, setup.max_rotation + abs(roll)), -roll)
-    turn = (there, 0.0, -there, 0.0)[memory.turns]
-    rest = 0.0 if turn else _READINGS * task.scenario.tracker.period
-    return Decision(STILL._replace(roll=turn), "half a turn in air, for the error of the tracker", rest=rest)
+    setup, first, why = task.scenario.setup, task.plan.roll, "half a turn in air, for the error of the tracker"
+    there = math.copysign(min(math.pi, setup.max_rotation + abs(first)), -first)
+    left = first + (there if memory.turns == 0 else 0.0) - roll
+    if abs(math.remainder(left, 2.0 * math.pi)) > _REACHED:
+        return Decision(STILL._replace(roll=left), why), memory
+    rest = _READINGS * task.scenario.tracker.period
+    return Decision(STILL, why, rest=rest), replace(memory, turns=memory.turns + 1)
 
 
 def _describe_rolls(path: GuidePath, axes: int) -> str:

@@ -229,7 +229,8 @@ class TrackerSettings(Section):
     enabled: bool = True
     """False: there is no tracker. Without one the scenario needs a `[[sensor]]`, and the depth is the motors'."""
     bias_sd_mm: NonNegative = 0.0
-    """Prior standard deviation, on each axis, of a constant error of the tracker, which `adaptive-mpc` estimates."""
+    """Prior standard deviation, on each axis, of a constant error of the tracker, which `adaptive-mpc` estimates. For
+    this it turns the needle by 180° and back in air."""
     field_sd_mm: NonNegative = 0.0
     """Standard deviation, on each axis, of an error of the tracker that is correlated along the path of the tip."""
     field_length_mm: Positive = 40.0
