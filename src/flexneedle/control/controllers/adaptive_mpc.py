@@ -177,7 +177,11 @@ def _turn_in_air(task: Task, memory: Memory, roll: float) -> tuple[Decision, Mem
     It separates a constant error of the tracker from the run-out, which turns with the needle. A turn that was not
     carried out is repeated.
     """
-    setup, first, why = task.scenario.setup, task.plan.roll, "half a turn in air, for the error of the tracker"
+    setup, first, why = (
+        task.scenario.setup,
+        task.plan.roll,
+        "half a turn in air, for the error of the tracker",
+    )
     there = math.copysign(min(math.pi, setup.max_rotation + abs(first)), -first)
     left = first + (there if memory.turns == 0 else 0.0) - roll
     if abs(math.remainder(left, 2.0 * math.pi)) > _REACHED:
