@@ -1,8 +1,8 @@
 """Insertions with sensors along the needle, healthy and faulty, in random worlds in space on the exact plant.
 
 Each row is a set of sensors with an error or a fault. Sites, planes, gains and faults are drawn for each world.
-The table has the lateral distance from the target and the lateral error of the estimate, in mm, and the share of ends
-within the 95 % region of the tip.
+The table has the lateral distance from the target and the lateral error of the estimate, in mm, and the shares of ends
+and of periods in the tissue within the 95 % region of the tip.
 
     python studies/sensors.py --worlds 100000 20 --out runs/sensors
 """
@@ -27,6 +27,7 @@ from flexneedle.scenario.worlds import world
 BIAS_MM = 2.7
 _SITES = (8.0, 120.0)
 _PLANES = (0.15, 0.9)
+_REGION = -2.0 * math.log(0.05)  # normalised square on two axes that 95 % are below
 
 
 class Row(NamedTuple):
@@ -169,8 +170,7 @@ def measure(insertion: Any, plan: Any) -> dict[str, Any]:
     early = (depth > 0.0) & (depth < plan.target[0] / 3.0)
     last = periods[-1]
     end = np.subtract(last.true_tip.point, plan.target)
-    sd = last.tip_covariance
-    across = np.nan if sd is None else float(off[-1] @ np.linalg.pinv(np.array(sd)[1:, 1:]) @ off[-1])
+    squares = np.array([_square(one.tip_covariance, each) for one, each in zip(periods, off, strict=True)])
     excluded = {}
     for one in periods:
         for state in one.sensors:
@@ -185,7 +185,8 @@ def measure(insertion: Any, plan: Any) -> dict[str, Any]:
         "miss_3d": float(np.linalg.norm(end)),
         "off": float(np.hypot(*off[-1])),
         "rms_early": float(np.sqrt(np.mean(np.sum(off[early] ** 2, axis=1)))) if early.any() else np.nan,
-        "nees": across,
+        "nees": float(squares[-1]),
+        "inside": float(np.mean(squares[depth > 0.0] < _REGION)) if np.isfinite(squares).all() else math.nan,
         "depth": float(depth[-1]),
         "excluded": len(excluded),
         "late_mm": late,
@@ -195,6 +196,11 @@ def measure(insertion: Any, plan: Any) -> dict[str, Any]:
         "sensors": "; ".join(f"{one.name}: {one.verdict}" for one in last.sensors if not one.verdict.ok),
         "reason": insertion.reason,
     }
+
+
+def _square(covariance: Any, off: Any) -> float:
+    """Return the normalised square of a lateral error (2,), mm; NaN without a covariance."""
+    return math.nan if covariance is None else float(off @ np.linalg.pinv(np.array(covariance)[1:, 1:]) @ off)
 
 
 def draw_figure(results: list[dict[str, Any]], path: Path) -> None:
@@ -240,7 +246,7 @@ def _worlds(first: int, count: int, guided: bool) -> Iterator[int]:
 
 def table(results: list[dict[str, Any]]) -> str:
     """Return the table of all rows."""
-    head = f"{'row':22}{'':10}{'n':>4}{'held':>6}{'miss':>8}{'95 %':>8}{'off':>8}{'95 %':>8}{'early':>8}{'in 95 %':>9}"
+    head = f"{'row':22}{'':10}{'n':>4}{'held':>6}{'miss':>8}{'95 %':>8}{'off':>8}{'95 %':>8}{'early':>8}{'in 95 %':>9}{'all':>6}"
     lines = [head + f"{'ms':>7}{'excluded':>9}{'12 mm':>7}{'bevel':>8}"]
     for row in ROWS:
         for guided in (True, False):
@@ -249,9 +255,7 @@ def table(results: list[dict[str, Any]]) -> str:
                 continue
             done = [one for one in mine if one["outcome"] == "done"]
             nees = np.array([one["nees"] for one in done])
-            inside = (
-                np.mean(nees < -2.0 * math.log(0.05)) if len(done) and np.isfinite(nees).all() else np.nan
-            )
+            inside = np.mean(nees < _REGION) if len(done) and np.isfinite(nees).all() else np.nan
             values = [
                 statistic([one[key] for one in done])
                 for key in ("miss", "off")
@@ -263,7 +267,8 @@ def table(results: list[dict[str, Any]]) -> str:
             lines.append(
                 f"{row.name:22}{'guided' if guided else 'unguided':10}{len(mine):4}{len(mine) - len(done):6}"
                 + "".join(f"{value:8.3f}" for value in (*values, early))
-                + f"{inside:9.2f}{np.median([one['observe_ms'] for one in mine]):7.1f}"
+                + f"{inside:9.2f}{np.mean([one['inside'] for one in mine]):6.2f}"
+                + f"{np.median([one["observe_ms"] for one in mine]):7.1f}"
                 + f"{np.mean([one['excluded'] > 0 for one in mine]):9.2f}{found:7.2f}"
                 + f"{np.median([one['bevel'] for one in mine]):8.3f}"
             )
