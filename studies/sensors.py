@@ -246,8 +246,8 @@ def _worlds(first: int, count: int, guided: bool) -> Iterator[int]:
 
 def table(results: list[dict[str, Any]]) -> str:
     """Return the table of all rows."""
-    head = f"{'row':22}{'':10}{'n':>4}{'held':>6}{'miss':>8}{'95 %':>8}{'off':>8}{'95 %':>8}{'early':>8}{'in 95 %':>9}{'all':>6}"
-    lines = [head + f"{'ms':>7}{'excluded':>9}{'12 mm':>7}{'bevel':>8}"]
+    head = f"{'row':22}{'':10}{'n':>4}{'held':>6}{'miss':>8}{'95 %':>8}{'off':>8}{'95 %':>8}{'early':>8}{'in 95 %':>9}"
+    lines = [head + f"{'all':>6}{'ms':>7}{'excluded':>9}{'12 mm':>7}{'bevel':>8}"]
     for row in ROWS:
         for guided in (True, False):
             mine = [one for one in results if one["row"] == row.name and one["guided"] == guided]
@@ -268,7 +268,7 @@ def table(results: list[dict[str, Any]]) -> str:
                 f"{row.name:22}{'guided' if guided else 'unguided':10}{len(mine):4}{len(mine) - len(done):6}"
                 + "".join(f"{value:8.3f}" for value in (*values, early))
                 + f"{inside:9.2f}{np.mean([one['inside'] for one in mine]):6.2f}"
-                + f"{np.median([one["observe_ms"] for one in mine]):7.1f}"
+                + f"{np.median([one['observe_ms'] for one in mine]):7.1f}"
                 + f"{np.mean([one['excluded'] > 0 for one in mine]):9.2f}{found:7.2f}"
                 + f"{np.median([one['bevel'] for one in mine]):8.3f}"
             )
