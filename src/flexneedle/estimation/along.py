@@ -5,6 +5,7 @@ before, each by the needle's angle at its time, so that the quantity of the mode
 offset turns instead.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +36,22 @@ class SensorSlots(NamedTuple):
     gain: slice
     turn: int | None
     clock: int | None
+
+
+class SensorPriors(NamedTuple):
+    """Prior standard deviations of the errors of a sensor; 0: not fitted, but for the offset, which always is."""
+
+    offset: float
+    gain: float
+    turn: float  # rad
+    clock: float  # s
+
+    @staticmethod
+    def of(sensor: Sensor) -> "SensorPriors":
+        """Return the scenario's."""
+        return SensorPriors(
+            sensor.offset_sd, sensor.gain_sd, math.radians(sensor.turn_sd_deg), sensor.delay_sd_s
+        )
 
 
 class Timeline(NamedTuple):
@@ -131,6 +148,39 @@ class SensorFit:
     time: Floats  # (r,), s
     value: Floats  # (r, d), NaN where nothing was measured
     used: Flags  # readings (r,) that correct the model
+
+    @staticmethod
+    def begin(
+        sensor: Sensor, axes: int, first: int, priors: SensorPriors, depths: Floats
+    ) -> "tuple[SensorFit, list[float]]":
+        """Return a sensor without readings, whose parameters begin at `first`, and their prior standard deviations.
+
+        depths: knots (k,) of its drift.
+        """
+        size, lateral = sensor.size(axes), axes if sensor.paired else 1
+        step = sensor.drift_sd / math.sqrt(max(1, depths.size))
+        groups = (
+            [priors.offset] * size,
+            [step] * (depths.size * lateral),
+            sensor.place_sds,
+            [priors.gain] * (size // lateral if priors.gain else 0),
+            [priors.turn] * (sensor.paired and axes == 2 and priors.turn > 0.0),
+            [priors.clock] * (priors.clock > 0.0),
+        )
+        ends = first + np.cumsum([0, *map(len, groups)])
+        offset, drift, place, gain, turned, clock = (
+            slice(*pair) for pair in itertools.pairwise(ends.tolist())
+        )
+        slots = SensorSlots(
+            offset,
+            drift,
+            place,
+            gain,
+            turned.start if groups[4] else None,
+            clock.start if groups[5] else None,
+        )
+        none = np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
+        return SensorFit(sensor, slots, axes, size, depths, *none), [sd for group in groups for sd in group]
 
     @property
     def name(self) -> str:

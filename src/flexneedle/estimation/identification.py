@@ -22,7 +22,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from flexneedle.estimation.along import DOUBT, Comparison, SensorFit, SensorSlots
+from flexneedle.estimation.along import DOUBT, Comparison, SensorFit, SensorPriors
 from flexneedle.estimation.axial import (
     AS_COMMANDED,
     EvenAdvance,
@@ -469,38 +469,14 @@ def add_sensors(prior: Prior, task: Task) -> tuple[Prior, Slots, tuple[SensorFit
     scenario = task.scenario
     slots, axes = Slots.of(scenario), scenario.setup.axes
     own = prior.mean.size
-    sds: list[float] = []
-
-    def add(values: Sequence[float]) -> slice:
-        begin = own + len(sds)
-        sds.extend(values)
-        return slice(begin, own + len(sds))
-
-    bias = add([scenario.tracker.bias_sd_mm] * axes) if scenario.tracker.bias_sd_mm else slots.bias
+    sds = [scenario.tracker.bias_sd_mm] * (axes if scenario.tracker.bias_sd_mm else 0)
+    bias = slice(own, own + len(sds)) if sds else slots.bias
     along = []
     for sensor in scenario.sensor:
-        size, paired = sensor.size(axes), sensor.paired and axes == 2
-        offset, grows = add([sensor.offset_sd] * size), _KNOTS if sensor.drift_sd else 0
-        step = sensor.drift_sd / math.sqrt(_KNOTS)
-        drift = add([step] * (grows * (axes if sensor.paired else 1)))
-        groups = size // axes if sensor.paired else size
-        place, gain = add(sensor.place_sds), add([sensor.gain_sd] * groups if sensor.gain_sd else [])
-        turned, clock = (
-            add([sd]).start if sd else None
-            for sd in (math.radians(sensor.turn_sd_deg) * paired, sensor.delay_sd_s)
-        )
-        along.append(
-            SensorFit(
-                sensor,
-                SensorSlots(offset, drift, place, gain, turned, clock),
-                axes,
-                size,
-                task.plan.target[0] / _KNOTS * np.arange(1.0, grows + 1.0),
-                np.zeros(0),
-                np.zeros((0, size)),
-                np.zeros(0, dtype=bool),
-            )
-        )
+        knots = task.plan.target[0] / _KNOTS * np.arange(1.0, 1.0 + _KNOTS * (sensor.drift_sd > 0.0))
+        one, more = SensorFit.begin(sensor, axes, own + len(sds), SensorPriors.of(sensor), knots)
+        along.append(one)
+        sds += more
     if not sds:
         return prior, slots, ()
     return prior.extend(sds), slots._replace(end=own, bias=bias), tuple(along)

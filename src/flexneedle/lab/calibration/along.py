@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from flexneedle.errors import InputError
-from flexneedle.estimation.along import Bins, SensorFit, SensorSlots, Timeline
+from flexneedle.estimation.along import Bins, SensorFit, SensorPriors, Timeline
 from flexneedle.lab.calibration.criteria import Criterion
 from flexneedle.lab.calibration.session import Recording
 from flexneedle.scenario.sensors.sensor import Sensor, turn
@@ -42,26 +42,13 @@ _HEAVY = 2.0  # standard deviations from which a residual counts less
 
 def lay_out(sensors: Sequence[Sensor], axes: int, begin: int) -> tuple[tuple[SensorFit, ...], list[float]]:
     """Return sensors with the places of their errors from `begin` on, and prior standard deviations of the errors."""
+    found: list[SensorFit] = []
     sds: list[float] = []
-
-    def add(values: Sequence[float]) -> slice:
-        sds.extend(values)
-        return slice(begin + len(sds) - len(values), begin + len(sds))
-
-    found = []
     for sensor in sensors:
-        size, paired = sensor.size(axes), sensor.paired and axes == 2
-        groups = size // axes if sensor.paired else size
-        slots = SensorSlots(
-            offset=add([max(sensor.offset_sd, _LEAST_SD)] * size),
-            drift=slice(begin, begin),
-            place=add(sensor.place_sds),
-            gain=add([sensor.gain_sd] * groups if sensor.gain_sd else []),
-            turn=add([math.radians(sensor.turn_sd_deg)]).start if paired and sensor.turn_sd_deg else None,
-            clock=None,
-        )
-        none = np.zeros(0), np.zeros(0), np.zeros((0, size)), np.zeros(0, dtype=bool)
-        found.append(SensorFit(sensor, slots, axes, size, *none))
+        priors = SensorPriors.of(sensor)._replace(offset=max(sensor.offset_sd, _LEAST_SD), clock=0.0)
+        one, more = SensorFit.begin(sensor, axes, begin + len(sds), priors, np.zeros(0))
+        found.append(one)
+        sds += more
     return tuple(found), sds
 
 

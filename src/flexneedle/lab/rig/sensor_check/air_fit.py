@@ -8,13 +8,12 @@ standard deviation stays near its prior is not found. Times are relative to the 
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from flexneedle.estimation.along import SensorFit, SensorSlots, Timeline
+from flexneedle.estimation.along import SensorFit, SensorPriors, Timeline
 from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.prior import LEAST_SD, Priors
 from flexneedle.lab.rig.sensor_check.air_run import AirRun
@@ -84,11 +83,9 @@ class AirModel:
         ]
         sensors = []
         for sensor in (one for one in scenario.sensor if one.title in names):
-            sensor_slots, more = wide_priors(sensor, axes, len(sds))
+            found, more = SensorFit.begin(sensor, axes, len(sds), wide_priors(sensor), np.zeros(0))
+            sensors.append(found)
             sds += more
-            size, empty = sensor.size(axes), np.zeros(0)
-            none = empty, np.zeros((0, size)), empty.astype(bool)
-            sensors.append(SensorFit(sensor, sensor_slots, axes, size, empty, *none))
         line = Timeline.of(run.moves, 0.0)
         tips = np.array([(one.time, one.x, one.y, one.z or 0.0) for one in run.measurements]).reshape(-1, 4)
         tips = tips[~rolling(line, tips[:, 0])]
@@ -154,21 +151,9 @@ class AirModel:
         return [one.quantities(shapes, self.length) for one in self.sensors]
 
 
-def wide_priors(sensor: Sensor, axes: int, begin: int) -> tuple[SensorSlots, list[float]]:
-    """Return the places of a sensor's parameters from `begin` on, and their prior standard deviations."""
-    size, paired = sensor.size(axes), sensor.paired and axes == 2
-    offset = OFFSET_SDS * max(sensor.offset_sd, sensor.noise)
-    sds = [
-        [offset] * size,
-        list(sensor.place_sds),
-        [GAIN_SD] * (size // 2 if paired else size),
-        [TURN_SD] * paired,
-        [CLOCK_SD],
-    ]
-    at = begin + np.cumsum([0, *map(len, sds)])
-    offsets, places, gains = (slice(int(first), int(last)) for first, last in pairwise(at[:4]))
-    slots = SensorSlots(offsets, slice(0, 0), places, gains, int(at[3]) if paired else None, int(at[4]))
-    return slots, [sd for group in sds for sd in group]
+def wide_priors(sensor: Sensor) -> SensorPriors:
+    """Return wide priors of the errors of a sensor."""
+    return SensorPriors(OFFSET_SDS * max(sensor.offset_sd, sensor.noise), GAIN_SD, TURN_SD, CLOCK_SD)
 
 
 def rolling(line: Timeline, times: Floats) -> Flags:
