@@ -15,9 +15,8 @@ and added as a constant.
 
 import cmath
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import takewhile
 
 import numpy as np
@@ -27,7 +26,6 @@ from flexneedle.estimation.axial import (
     AS_COMMANDED,
     EvenAdvance,
     axial_errors_prior,
-    axial_variance,
     fit_axial_error,
     fit_even_advance,
     replay_scaled,
@@ -41,14 +39,14 @@ from flexneedle.estimation.fit import (
     cost_of,
     differentiate,
     improve_fit,
-    lasting_covariance,
     simulate_due,
     variance_of_rows,
 )
-from flexneedle.estimation.fitted import LASTING, TRACKER, FittedInsertion
-from flexneedle.estimation.lateral import components, directions, from_components, variance_of
+from flexneedle.estimation.fitted import LASTING, TRACKER
+from flexneedle.estimation.known import KnownInsertion
+from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.moves import Move, assign_readings, position_along
-from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
+from flexneedle.estimation.prior import Prior, Priors, Slots, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.sensors.sensor import read_values
@@ -68,8 +66,6 @@ from flexneedle.types import (
     Z,
 )
 
-_DOUBTED = 3.5  # standard deviations
-_KNOWN = 0.5  # share of its prior variance that a parameter may keep when it is compared with the prior
 _REFITS = 4  # steps of the fit after a sensor is excluded
 _KNOTS = 3  # of a drift, down to the target
 _RECENT = 12  # moves whose residuals are low-passed
@@ -119,12 +115,9 @@ class Identification:
 
 
 @dataclass(frozen=True, eq=False)
-class Identified(FittedInsertion):
+class Identified(KnownInsertion):
     """An `Estimate` with fitted parameters."""
 
-    axial_covariance: Floats = field(
-        default_factory=lambda: np.zeros((3, 3))
-    )  # of axial (mm), axial_scale and play (mm)
     axial_bias: float = 0.0  # constant error of the tracker along the axis (mm)
     even_advance: EvenAdvance = AS_COMMANDED
     residual: complex = 0.0  # low-passed residual (mm)
@@ -243,63 +236,6 @@ class Identified(FittedInsertion):
         )
 
     @property
-    def tip_sd(self) -> float:
-        """Standard deviation (mm) of the predicted distance of the next reading of the tip, which is in motion.
-
-        At rest an unknown play would excuse lateral jumps.
-        """
-        slope = self._tip_slope
-        if self.slots.bias.stop:
-            slope[self.slots.bias] = directions(1.0, self.axes)
-        axial = axial_variance(self.axial_covariance, self._axial_slope(1.0))
-        field = (self.axes + 1) * self.field_sd**2
-        return float(np.sqrt(variance_of(slope, self.covariance) + axial + field))
-
-    @property
-    def _tip_slope(self) -> Laterals:
-        """Derivatives (K,) of the tip's lateral position to the parameters."""
-        slope: Laterals = self.slopes(self.state.tip[:1])[0]
-        slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
-        return slope
-
-    def _axial_slope(self, bias: float) -> list[float]:
-        """Return the derivatives of the tip's x to the axial errors, of its reading with `bias` = 1."""
-        return [1.0, float(self.state.travel[DB_X]), 1.0, bias][: len(self.axial_covariance)]
-
-    @cached_property
-    def tip_covariance(self) -> Floats:
-        """Covariance (3, 3) of the tip's x, y, z (mm²), with the errors of the model that last."""
-        slope = self._tip_slope
-        parts = np.stack([slope.real, slope.imag])
-        covariance = np.zeros((3, 3))
-        covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
-        covariance[1:, 1:] = parts @ self.covariance @ parts.T + self._lasting
-        return covariance
-
-    @cached_property
-    def _lasting(self) -> Floats:
-        """Covariance (2, 2) of the tip's y and z (mm²) by the errors of the model that last."""
-        slope = self._tip_slope
-        model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
-        left = model**2 * (1.0 - math.exp(-2.0 * self._age_of_residual / LASTING))
-        gains = np.stack([slope.real, slope.imag]) @ self.covariance
-        # Errors that cancel, since the needle was turned, are not subtracted: this is to first order only.
-        sizes, ways = np.linalg.eigh(lasting_covariance(self, gains))
-        lasting: Floats = (ways * np.maximum(sizes, 0.0)) @ ways.T + left * np.diag([1.0, self.axes - 1.0])
-        return lasting
-
-    @property
-    def lasting_variance(self) -> float:
-        """Variance (mm²) of the tip's lateral position, on an axis, by the errors of the model that last."""
-        return float(np.trace(self._lasting)) / self.axes if self.along else 0.0
-
-    @property
-    def _age_of_residual(self) -> float:
-        """Moves since the low-passed residual was known: what has changed since then is the model's error."""
-        read = [k for k, done in enumerate(self.moves) if done.measurements]
-        return float(len(self.moves) - read[-1]) if read else math.inf
-
-    @property
     def bias(self) -> Point:
         """Constant error x, y, z (mm) of the tracker; 0 where it is not estimated."""
         y, z = components(self.parameters[self.slots.bias]) if self.slots.bias.stop else (0.0, 0.0)
@@ -376,55 +312,6 @@ class Identified(FittedInsertion):
         )
         return Comparison(values, values - predicted, known, one.sensor.noise)
 
-    def shape_sd(self, nodes: Floats) -> Floats:
-        """Return standard deviations (n, 2), mm, of y and z at nodes (n, 5), as of a tip that passes there."""
-        slopes = self.slopes(nodes[:, 0])
-        parts = np.stack([slopes.real, slopes.imag])
-        sd: Floats = np.sqrt(np.einsum("ank,kl,anl->na", parts, self.covariance, parts))
-        return sd
-
-    @property
-    def bevel_sd(self) -> float:
-        """Standard deviation of the factor on the bevel offset, relative to it."""
-        k = self.slots.bevel
-        return float(np.sqrt(self.covariance[k, k]) / max(self.parameters[k], LEAST_SD))
-
-    @cached_property
-    def doubt(self) -> str:
-        """A line if the readings contradict the scenario's moduli or bevel, else "".
-
-        A posterior mean minus the prior's is a normal variable, whose variance is the prior's minus the posterior's.
-        """
-        ratio, name, factor = max(self._compare())
-        if ratio < _DOUBTED:
-            return ""
-        return f"the readings contradict the scenario: {name} is {factor:.2g} times its value there"
-
-    def _compare(self) -> Iterator[tuple[float, str, float]]:
-        """Yield for each of `_compared` its deviation in standard deviations, 0 if little is known; name, factor."""
-        for name, weights in self._compared():
-            off = float(weights @ (self.parameters - self.prior.mean))
-            before, after = (
-                float(weights @ each @ weights) for each in (self.prior.covariance, self.covariance)
-            )
-            ratio = abs(off) / np.sqrt(before - after) if after < _KNOWN * before else 0.0
-            yield ratio, name, 1.0 + off if weights[self.slots.bevel] else float(np.exp(off))
-
-    def _compared(self) -> Iterator[tuple[str, Floats]]:
-        """Yield the mean ln of each layer's modulus above the tip, and the bevel, as weights (K,) of the parameters."""
-        tissue, slots = self.nominal.scenario.tissue, self.slots
-        unit, tops = np.eye(self.parameters.size), (*self.nominal.scenario.layer_tops, np.inf)
-        cells = slots.modulus + 2 * len(tissue) - 1
-        for k, layer in enumerate(tissue):
-            starts = self.prior.begins[cells:]
-            inside = (starts >= tops[k]) & (starts < min(tops[k + 1], float(self.state.tip[X])))
-            if inside.any():
-                yield (
-                    f"the modulus of {layer.name}",
-                    unit[slots.modulus + k] + unit[cells:][inside].mean(axis=0),
-                )
-        yield "the bevel offset", unit[slots.bevel]
-
     @property
     def lag(self) -> float:
         """Time (s) from the newest reading to the end of the last move."""
@@ -444,24 +331,6 @@ class Identified(FittedInsertion):
         return not self.along or (
             bool(self.moves) and self.moves[-1].motion.ended - self._tracked_at <= limit
         )
-
-    @property
-    def roll_sd(self) -> float:
-        """Standard deviation (mm) of the tip's lateral motion if the bevel rolls now."""
-        bend, run_out = self.slots.bend, self.slots.run_out
-        slope = np.zeros(self.parameters.size, dtype=self.curves.dtype)
-        slope[bend] = 2.0 * self.slopes(self.state.tip[:1])[0, bend]
-        slope[run_out] = 2.0 * directions(1.0, self.axes)
-        return float(np.sqrt(variance_of(slope, self.covariance)))
-
-    @property
-    def reading_variance(self) -> float:
-        """Variance of the mean of the readings of a control step (mm²)."""
-        scenario = self.nominal.scenario
-        step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
-        count = max(1.0, step / scenario.tracker.period)
-        unexplained = self.sensors[0].unexplained(scenario, self.settings)
-        return float(scenario.tracker.jitter_per_axis**2 / count + unexplained**2)
 
 
 def add_sensors(prior: Prior, task: Task) -> tuple[Prior, Slots, tuple[SensorFit, ...]]:
