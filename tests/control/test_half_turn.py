@@ -29,7 +29,7 @@ def test_the_needle_returns_and_keeps_its_limits(changes, roll):
     plan = replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=scenario, roll=roll)
     task = task_of(Simulator(scenario, threads=1), plan)
     memory, angle, steps = ADAPTIVE.begin(task), roll, []
-    while memory.turns < 2:
+    while memory.turns < adaptive_mpc._DONE:
         decision, memory = adaptive_mpc._turn_in_air(task, memory, angle)
         Limits.of(scenario).check(np.zeros(7), np.array([decision.command]), angle)
         turn = decision.command.roll
@@ -59,6 +59,30 @@ def test_the_error_of_the_tracker_is_known_before_the_needle_advances():
     sds = np.sqrt(np.diag(first.covariance))
     assert sds[first.slots.bias].max() < 0.15
     assert insertion.true_error_mm < 0.3
+
+
+def test_a_turn_that_ends_a_little_short_is_done():
+    task = task_of(
+        Simulator(SPACE, threads=1), replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=SPACE)
+    )
+    memory, angle, rolls = ADAPTIVE.begin(task), 0.0, 0
+    while memory.turns < adaptive_mpc._DONE:
+        decision, memory = adaptive_mpc._turn_in_air(task, memory, angle)
+        angle += 0.99 * decision.command.roll
+        rolls += decision.command.roll != 0.0
+    assert rolls == 2
+
+
+def test_without_a_tracker_there_is_none():
+    changes = {
+        "tracker.bias_sd_mm": 1.0,
+        "tracker.enabled": False,
+        "sensor": [{"kind": "fbg", "sites_mm": [20.0]}],
+    }
+    scenario = SPACE.with_values(changes)
+    plan = replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=scenario)
+    task = task_of(Simulator(scenario, threads=1), plan)
+    assert not adaptive_mpc._may_turn(task, Identification().begin(task))
 
 
 def test_a_tracker_without_a_constant_error_needs_none():

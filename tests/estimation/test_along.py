@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from flexneedle.estimation.along import between, whiten
+from flexneedle.estimation.along import DOUBT, between, whiten
 from flexneedle.estimation.fit import differentiate, jacobian_of, lasting_covariance, simulate_due
 from flexneedle.estimation.fitted import LASTING
+from flexneedle.types import Reading
 from sensed import followed
 
 
@@ -57,6 +58,26 @@ def test_turns_in_air_have_derivatives_of_their_own():
         np.testing.assert_allclose(
             jacobian_of(estimate)[still, k], at_tip[still], atol=0.1 * np.abs(at_tip).max()
         )
+
+
+def test_a_prediction_is_as_uncertain_as_the_parameters_in_the_axes_of_the_sensor():
+    """By predictions with other parameters, of a needle that has rolled by an odd angle."""
+    estimate, _ = followed(count=20)
+    reading = [Reading(estimate.along[0].time[-1], ((0.0, 0.0),) * 4)]
+    compared = estimate.compare("fbg", reading)
+    sd = estimate.prior.steps
+    columns = []
+    for k in range(estimate.parameters.size):
+        step = sd[k] if k < estimate.slots.end else 1e-3 * np.sqrt(estimate.prior.covariance[k, k])
+        other = estimate.simulate_with(
+            estimate.parameters + step * (np.arange(estimate.parameters.size) == k)
+        )
+        columns.append((compared.residual - other.compare("fbg", reading).residual)[-1] / step)
+    jacobian = np.array(columns).T
+    known = jacobian @ estimate.covariance @ jacobian.T
+    one = estimate.along[0]
+    model = np.diag((DOUBT * one.sensor.model_error((compared.value - compared.residual)[-1:])[0]) ** 2)
+    np.testing.assert_allclose(compared.covariance - model, known, atol=0.05 * np.diag(known).max())
 
 
 def test_the_derivative_to_the_clock_is_that_of_readings_at_other_times():

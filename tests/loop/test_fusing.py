@@ -26,11 +26,12 @@ def planned():
     return scenario, flexneedle.plan(scenario, seed=0)
 
 
-def inserted(*sensors, seed=3, **changes):
+def inserted(*sensors, seed=3, listeners=(), **changes):
     """An insertion with sensors along the needle."""
     scenario, plan = planned()
     changes = {key.replace("__", "."): value for key, value in changes.items()}
-    return flexneedle.insert(scenario.with_values({"sensor": [*sensors], **changes}), plan, seed=seed)
+    scenario = scenario.with_values({"sensor": [*sensors], **changes})
+    return flexneedle.insert(scenario, plan, seed=seed, listeners=listeners)
 
 
 def off(insertion):
@@ -114,10 +115,28 @@ def test_the_needle_is_held_where_no_sensor_measures_it():
     assert insertion.periods[-1].true_tip.x < 14.0 + 3.0
 
 
+def test_without_a_tracker_the_needle_moves_only_after_a_reading():
+    dead = {**FBG, "phantom": {"fault": {"kind": "lost", "depth_mm": -100.0}}}
+    insertion = inserted(dead, tracker__enabled=False)
+    assert insertion.outcome == "held"
+    assert "no good reading of any sensor yet" in insertion.reason
+    assert all(period.applied.db_x == 0.0 for period in insertion.periods)
+
+
 def test_images_that_the_needle_has_not_come_to_yet_are_no_loss():
     insertion = inserted(*SLICES, phantom__tracker_lost_mm=8.0)
     assert insertion.outcome == "done"
     assert off(insertion) < 0.5
+
+
+def test_all_that_freeze_at_once_are_fitted_again_without_their_last_readings():
+    frozen = {"phantom": {"fault": {"kind": "frozen", "depth_mm": 15.0}}}
+    planes = [{**one, **frozen, "plane_mm": 5.0 + k} for k, one in enumerate(SLICES)]
+    events = []
+    inserted(*planes, listeners=[events.append])
+    last = [one for one in events if isinstance(one, flexneedle.Decided)][-1].estimate
+    later = last.moves[int(np.searchsorted(last.tips[1:, 0], 16.0))].motion.ended
+    assert [bool((one.time[one.used] > later).any()) for one in last.along] == [False, False]
 
 
 def test_a_sensor_that_jumps_is_excluded():

@@ -222,6 +222,8 @@ class SensorFit:
         def total(rows: NDArray[Any]) -> NDArray[Any]:
             return np.add.reduceat(rows, first) if len(first) else rows
 
+        if self.sensor.rolls and self.axes == 2:  # a pair is turned as a whole
+            seen = np.repeat(seen[:, ::2] & seen[:, 1::2], 2, axis=1)
         if self.sensor.rolls:  # between the ends of a roll its axes and the needle turn unevenly
             seen &= ~line.rolls[index][:, None]
         number, count = total(np.ones(len(index))), total(seen.astype(float))

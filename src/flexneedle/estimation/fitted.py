@@ -37,6 +37,8 @@ class Perturbed:
 
 LASTING = 10
 """Moves over which the model's error lasts."""
+ANGLES = 3
+"""Angles of the needle in air whose derivatives are kept, besides the last."""
 TRACKER = "tracker"
 """Name of the tracker among the sensors."""
 
@@ -191,14 +193,17 @@ class FittedInsertion:
     def places(self, depth: Floats) -> Floats:
         """Return the places (n,), mm, on the grid of the curves of needles at depths (n,): after the first moves.
 
-        These are the depths, but turns at rest before the first advance change the derivatives at one depth. So each
-        angle of the needle there has a place of its own, at the beginning of the grid, but the last.
+        These are the depths. But where the error of the tracker or sensors along the needle are fitted, turns at rest
+        before the first advance give other derivatives at the same depth: the angles before the last one have places at
+        the beginning of the grid.
         """
+        if not (self.along or self.slots.bias.stop):
+            return depth
         still = np.logical_and.accumulate(self.rows[:, DB_X] == 0.0)
-        turned = np.append(0, np.cumsum(self.rows[still, ROLL] != 0.0))
+        turned = np.append(0, np.cumsum(self.rows[still, ROLL:].any(axis=1)))
         before = np.flatnonzero(turned < turned[-1])
         places = depth.copy()
-        places[before] = self.grid[1 + turned[before]]
+        places[before] = self.grid[np.maximum(1, ANGLES + turned[before] - turned[-1] + 1)]
         return places
 
     def depths(self, bins: Bins) -> Floats:

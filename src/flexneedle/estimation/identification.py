@@ -36,13 +36,11 @@ from flexneedle.estimation.faults import Fault, find_faults
 from flexneedle.estimation.fit import (
     ROUND,
     Whitening,
-    cost_of,
     differentiate,
     improve_fit,
     simulate_due,
-    variance_of_rows,
 )
-from flexneedle.estimation.fitted import LASTING, TRACKER
+from flexneedle.estimation.fitted import LASTING
 from flexneedle.estimation.known import KnownInsertion
 from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.moves import Move, assign_readings, position_along
@@ -85,7 +83,9 @@ class Identification:
         prior, slots, along = add_sensors(prior, task)
         step = scenario.setup.max_advance_mm
         begin = scenario.setup.start_tip_x - 5 * step
-        if slots.bias.stop:  # room for the angles of the needle in air, whatever the start along the axis
+        if (
+            along or slots.bias.stop
+        ):  # room for angles of the needle in air, whatever the start along the axis
             begin -= 4.0 * scenario.control.start_axial_sd_mm
         grid = np.arange(begin, scenario.setup.max_depth + (ROUND + 6) * step, step)
         length = scenario.needle.length_mm
@@ -270,13 +270,9 @@ class Identified(KnownInsertion):
         return np.array([read_values(one.sensor, each, needle, self.axes) for each in readings])
 
     def without(self, name: str, since: float) -> "Identified":
-        """Return the estimate fitted again without the readings of a sensor, or the `TRACKER`, from a time (s) on."""
-        if name == TRACKER:
-            moves = tuple(done.without_readings(since) for done in self.moves)
-            fitted = self.change(moves=moves)._fit_axially()
-        else:
-            along = tuple(one.without(since) if one.name == name else one for one in self.along)
-            fitted = self.change(along=along)
+        """Return the estimate fitted again without the readings of a sensor along the needle, from a time (s) on."""
+        along = tuple(one.without(since) if one.name == name else one for one in self.along)
+        fitted = self.change(along=along)
         for _ in range(_REFITS):
             fitted = improve_fit(fitted)
         if not len(fitted.readings[0].index):
@@ -289,12 +285,6 @@ class Identified(KnownInsertion):
         """Return the likeliest fault of each sensor by name, see `flexneedle.estimation.faults`."""
         return find_faults(self)
 
-    @property
-    def cost(self) -> float:
-        """Negative logarithm of the posterior density, up to a constant."""
-        variance = variance_of_rows(self)
-        return cost_of(self, variance, Whitening.of(self, variance) if self.has_field else None)
-
     def compare(self, name: str, readings: Sequence[Reading]) -> Comparison:
         """Return readings (r,) of a sensor along the needle beside their predictions."""
         k = next(k for k, one in enumerate(self.along) if one.name == name)
@@ -304,7 +294,8 @@ class Identified(KnownInsertion):
         bins = one.bin_at(time[-1:], self.timeline)
         depth = self.depths(bins)
         slopes = self.along_slopes(depth, k)
-        jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)[0]
+        jacobian = one.jacobian(bins, ends, depth, slopes, self.parameters, self.timeline)
+        jacobian = one.in_its_axes(jacobian.transpose(2, 0, 1), bins)[:, 0].T
         known = (
             jacobian @ self.covariance @ jacobian.T
             + np.diag((DOUBT * one.sensor.model_error(predicted[-1:])[0]) ** 2)

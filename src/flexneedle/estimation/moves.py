@@ -106,13 +106,6 @@ class Move:
         older = replace(self, measurements=every[:count])
         return replace(self, measurements=every[count:], earlier=older.means)
 
-    def without_readings(self, since: float) -> "Move":
-        """Return the move without the readings from a time (s) on."""
-        kept = tuple(one for one in self.measurements if one.time < since)
-        if len(kept) == len(self.measurements):
-            return self
-        return replace(self, measurements=kept, earlier=self.earlier if self.motion.begun < since else {})
-
     @staticmethod
     def of(motion: Motion) -> "Move":
         """Return a motion without readings."""

@@ -107,7 +107,8 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         step, decided = steering.next_step(state, rig, begun)
         clocks.append(time.perf_counter())
         if rig.expect is not None:
-            rig.expect(state.observation.estimate, step.decision.command, state.observation.sensed)
+            sensed = state.observation.sensed_at(task.scenario, begun)
+            rig.expect(state.observation.estimate, step.decision.command, sensed)
         motion = _carry_out(task.scenario, rig, step, begun)
         clocks.append(time.perf_counter())
         predicted = state.observation.estimate.move(motion)

@@ -117,10 +117,11 @@ def exclude_faulty(
     before: the watch of the period before, to see which sensors have been found frozen since.
     """
     depth = float(estimate.tips[-1, X])
-    for one in states:
-        if not one.verdict.ok and before.of(one.name).excluded.ok:  # frozen
-            since = _time_of_depth(estimate, min(depth, watch.of(one.name).since))
-            return estimate.without(one.name, since), watch, tuple(states), OK
+    frozen = [one.name for one in states if not one.verdict.ok and before.of(one.name).excluded.ok]
+    for name in frozen:
+        estimate = estimate.without(name, _time_of_depth(estimate, min(depth, watch.of(name).since)))
+    if frozen:
+        return estimate, watch, tuple(states), OK
     if len(estimate.moves) - watch.judged < _MOVES:
         return estimate, watch, tuple(states), OK
     faults = {name: one for name, one in estimate.faults().items() if watch.of(name).excluded.ok}
@@ -171,15 +172,26 @@ def set_field(scenario: Scenario, estimate: Any, monitor: Monitor, since: float)
 
 def check_silent(scenario: Scenario, watch: Watch, now: float) -> Verdict:
     """Require a good reading of some sensor that is not excluded: never move on predictions alone; now (s)."""
-    limits = {one.title: one.delay_s + 1.0 / one.rate_hz for one in scenario.sensor} | {TRACKER: 0.0}
-    ages = {
-        name: now - watch.of(name).heard - more for name, more in limits.items() if watch.of(name).excluded.ok
-    }
-    least = min(ages.values(), default=math.inf)
+    least = min(_silence(scenario, watch, now), now - watch.of(TRACKER).heard)
     if least <= scenario.control.stale_after_s:
         return OK
-    reason = f"no good reading of any sensor for {least:.2f} s, limit {scenario.control.stale_after_s:.2f} s"
+    since = (
+        f"for {least:.2f} s, limit {scenario.control.stale_after_s:.2f} s" if math.isfinite(least) else "yet"
+    )
+    reason = f"no good reading of any sensor {since}"
     return Verdict(VerdictKind.MISSING, reason)
+
+
+def is_sensed(scenario: Scenario, watch: Watch, now: float) -> bool:
+    """Return if a sensor along the needle, not excluded, has a good reading that is not stale; now (s)."""
+    return _silence(scenario, watch, now) <= scenario.control.stale_after_s
+
+
+def _silence(scenario: Scenario, watch: Watch, now: float) -> float:
+    """Return the time (s) since the last good reading of any sensor along the needle, less its delay and period."""
+    good = (one for one in scenario.sensor if watch.of(one.title).excluded.ok)
+    ages = (now - watch.of(one.title).heard - one.delay_s - 1.0 / one.rate_hz for one in good)
+    return min(ages, default=math.inf)
 
 
 def check_uncertain(

@@ -12,6 +12,7 @@ from flexneedle.loop.fusing import (
     check_silent,
     check_uncertain,
     exclude_faulty,
+    is_sensed,
     read_sensors,
     set_field,
 )
@@ -47,10 +48,9 @@ class Observation:
         tip = any(one.verdict.ok and one.measurement.time > time - 1e-6 for one in self.readings)
         return tip or any(taken > time - 1e-6 for taken in self._sensor_times)
 
-    @property
-    def sensed(self) -> bool:
-        """True if a sensor along the needle has a good reading of this period that corrects the estimate."""
-        return bool(self._sensor_times)
+    def sensed_at(self, scenario: Scenario, now: float) -> bool:
+        """Return if a sensor along the needle measures it at a time (s), and corrects the estimate."""
+        return can_fuse(self.estimate) and is_sensed(scenario, self.watch, now)
 
     @property
     def newest(self) -> float:
@@ -74,8 +74,8 @@ def observe_before_start(
 
     The estimate is not corrected.
     """
-    if not scenario.tracker.enabled:
-        return Observation(estimate, monitor)
+    if not scenario.tracker.enabled:  # the first readings of the sensors come in the first period, at rest
+        return Observation(estimate, monitor, verdict=Verdict(VerdictKind.MISSING, "there is no tracker"))
     measurements = tracker.read()
     stale_after = scenario.control.stale_after_s
     if not measurements:

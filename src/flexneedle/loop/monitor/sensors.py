@@ -25,7 +25,7 @@ class SensorMonitor:
 
     newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them;
     outliers: number of the last readings, one after another, far from their predictions; excluded: why the sensor does
-    not count any more; heard: time (s) of the last reading that is good, or that has no needle where none is, 0 before.
+    not count any more; heard: time (s) of the last reading that is good, or that has no needle where none is.
     """
 
     newest: Reading | None = None
@@ -33,7 +33,7 @@ class SensorMonitor:
     since: float = 0.0
     outliers: int = 0
     excluded: Verdict = OK
-    heard: float = 0.0
+    heard: float = -math.inf
 
     def hear(self, times: Iterable[float]) -> "SensorMonitor":
         """Return the state with the times (s) of readings."""

@@ -41,8 +41,8 @@ class SupervisorTask:
 class Expectation:
     """Expected positions (mm) of the tip at begin and end of a step.
 
-    most_off: largest distance of a reading from them (mm); sensed: a sensor along the needle has measured it since the
-    step before, and corrects the estimate, so that a lost tracker ends neither this step nor the rest after it.
+    most_off: largest distance of a reading from them (mm); sensed: a sensor along the needle measures it, and corrects
+    the estimate, so that a lost tracker ends neither this step nor the rest after it.
     """
 
     begin: Point
