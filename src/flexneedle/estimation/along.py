@@ -25,7 +25,7 @@ _ROUNDING_S = 1e-9
 
 
 class SensorSlots(NamedTuple):
-    """Places of a sensor's parameters: offset (d), and where they exist gain errors, turn (rad) and clock error (s).
+    """Places of a sensor's parameters: offset and where they exist gain errors, turn (rad) and clock error (s).
 
     drift: steps, one after another, of an error of all values that grows along the way; gain: of each pair of values.
     """
@@ -160,7 +160,7 @@ class SensorFit:
         size, lateral = sensor.size(axes), axes if sensor.paired else 1
         step = sensor.drift_sd / math.sqrt(max(1, depths.size))
         groups = (
-            [priors.offset] * size,
+            [priors.offset] * (lateral if sensor.common_offset else size),
             [step] * (depths.size * lateral),
             sensor.place_sds,
             [priors.gain] * (size // lateral if priors.gain else 0),
@@ -304,7 +304,8 @@ class SensorFit:
 
     def _errors(self, depth: Floats, parameters: Floats) -> Floats:
         """Return offset and drift (b, d), with the tip at depths (b,), mm."""
-        offset = np.broadcast_to(parameters[self.slots.offset], (len(depth), self.size))
+        own = parameters[self.slots.offset]
+        offset = np.broadcast_to(np.tile(own, self.size // own.size), (len(depth), self.size))
         if self.slots.drift.stop == self.slots.drift.start:
             return offset
         return offset + self._spread(depth) @ parameters[self.slots.drift]
@@ -340,9 +341,9 @@ class SensorFit:
         slopes_of_places, ends = ends[:, :, 1:], self.placed(ends, parameters)
         level = between(bins, ends)
         jacobian = self._gains(parameters)[:, None] * slopes.transpose(0, 2, 1)
-        for k in range(level.shape[1]):
-            unit = np.broadcast_to(np.eye(level.shape[1])[k], level.shape)
-            jacobian[:, :, self.slots.offset.start + k] = self._turned(unit, bins.facing)
+        for k, unit in enumerate(np.eye(self.slots.offset.stop - self.slots.offset.start)):
+            each = np.broadcast_to(np.tile(unit, self.size // unit.size), level.shape)
+            jacobian[:, :, self.slots.offset.start + k] = self._turned(each, bins.facing)
         if self.slots.drift.stop > self.slots.drift.start:
             spread = self._spread(depth)
             for k in range(spread.shape[2]):

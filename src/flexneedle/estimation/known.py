@@ -1,4 +1,4 @@
-"""How well an insertion with fitted parameters knows its tip, its shape and its parameters."""
+"""Standard deviations of the tip, the shape and the parameters of a fitted insertion."""
 
 import math
 from collections.abc import Iterator

@@ -48,6 +48,7 @@ class Range(KeyedSensor):
 class Points(Range):
     """One `[[sensor]]` with `kind = "points"`."""
 
+    common_offset = True
     paired = True
     keys = Keys("noise_mm", "place_sd_mm", "wander_mm")
     unit = 1.0, "mm"

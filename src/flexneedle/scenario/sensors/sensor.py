@@ -77,6 +77,8 @@ class Sensor(Section):
     """True: values are lateral quantities: y in the plane, in space y and z, one after the other, as a vector."""
     rolls: ClassVar[bool] = False
     """True: the sensor is in the needle and rolls with it. Its values are `paired`."""
+    common_offset: ClassVar[bool] = False
+    """True: the constant error is a shift of all values together, of each coordinate, as by a registration."""
     keys: ClassVar[Keys] = Keys()
     """Names for the results of `flexneedle sensor check`."""
     unit: ClassVar[tuple[float, str]] = 1.0, ""
@@ -190,7 +192,8 @@ class Sensor(Section):
 
     def drawn_offset(self, rng: np.random.Generator, axes: int) -> "Floats":
         """Return the offset (d,) of the virtual sensor."""
-        return rng.normal(0.0, self.offset_sd, self.size(axes))
+        size, width = self.size(axes), axes if self.paired else 1
+        return np.resize(rng.normal(0.0, self.offset_sd, width if self.common_offset else size), size)
 
 
 class KeyedSensor(Sensor):

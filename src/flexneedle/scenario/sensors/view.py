@@ -30,6 +30,7 @@ class View(Range):
     A value is a coordinate across the insertion axis in the image; coordinates along it are not used.
     """
 
+    common_offset = True
     keys = Keys("noise_px", "pose_sd_px", "wander_px")
     unit = 1.0, "px"
 

@@ -187,10 +187,11 @@ class AirFit:
         return value, max(sd, self.profile_sds[number] - _GRID_S)
 
     def offset(self, number: int) -> list[tuple[float, float]]:
-        """Return the offsets (d,) of a sensor, and their standard deviations, with the error of the model."""
+        """Return the offsets of a sensor, and their standard deviations, with the error of the model."""
         one = self.model.sensors[number]
-        unexplained = one.sensor.model_error(self.predicted[number]).mean(axis=0)
-        means = map(self.mean, range(one.slots.offset.start, one.slots.offset.stop))
+        places = range(one.slots.offset.start, one.slots.offset.stop)
+        means, errors = map(self.mean, places), one.sensor.model_error(self.predicted[number])
+        unexplained = errors.reshape(-1, len(places)).mean(axis=0)
         return [(value, math.hypot(sd, more)) for (value, sd), more in zip(means, unexplained, strict=True)]
 
     def predict_without_errors(self) -> list[Floats]:
