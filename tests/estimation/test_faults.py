@@ -76,7 +76,7 @@ def test_an_error_of_the_tracker_that_grows_is_the_tracker_s():
     assert found[TRACKER].log_odds > 4.0
 
 
-def test_what_the_tracker_alone_says_against_the_model_is_no_fault_of_it():
+def test_the_evidence_of_the_tracker_alone_is_no_fault_of_it():
     estimate, _ = followed()
     depth = float(estimate.tips[-1, 0])
     alone = moved(estimate, lambda x: 1.0 * (x > depth - 4.0)).change(

@@ -173,7 +173,7 @@ class Controller:
 
     @property
     def fuses(self) -> bool:
-        """Whether its observer is corrected by sensors along the needle, too; else they are recorded only."""
+        """True if sensors along the needle correct its observer, too; else they are recorded only."""
         return bool(getattr(self.observer, "fuses", False))
 
     @property

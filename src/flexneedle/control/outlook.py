@@ -99,8 +99,8 @@ class Outlook:
     def sd_after(self, estimate: Identified, target: float, depths: Floats) -> Floats:
         """Return standard deviations (d,), mm, on an axis, of the end if uncorrected, after readings down to depths.
 
-        Of the tracker: its constant error stays unknown. The error of its field is noise whose mean over as many steps
-        as it lasts has its full size.
+        Of the tracker: what sensors along the needle will measure does not count. Its constant error stays unknown. The
+        error of its field is noise whose mean over as many steps as it lasts has its full size.
         """
         end, to_come, read = self.at(target), self.grid > estimate.state.tip[X], self.curves
         if estimate.slots.bias.stop:
