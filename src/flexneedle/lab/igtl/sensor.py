@@ -1,7 +1,8 @@
 """The sensor `igtl`: points along the needle, or one point, that an OpenIGTLink peer sends.
 
 POINT has one or more points along the needle; TRANSFORM and POSITION have one. Points are placed as targets are
-(`placement`): by the registration of the scenario's image, or without one in the needle's frame.
+(`placement`): by the registration of the scenario's image, or without one in the needle's frame. The points of a
+`view` have column and row of a pixel as x and y.
 """
 
 from collections.abc import Mapping
@@ -29,6 +30,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.points import Points
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.scenario.sensors.slice import Slice
+from flexneedle.scenario.sensors.view import View
 from flexneedle.types import Point, Reading
 
 
@@ -50,13 +52,13 @@ class PointsReader(MessageReader[Reading]):
         self, settings: IgtlSensorSettings, sensor: Sensor, registration: ImageRegistration | None
     ) -> None:
         super().__init__(settings)
-        self._is_slice = isinstance(sensor, Slice)
+        self._is_slice, self._in_pixels = isinstance(sensor, Slice), isinstance(sensor, View)
         self._delay = sensor.delay_s  # of the message with the least delay, if stamps are used
         self._image, self._own, self._wrong = settings.registration, registration, ""
 
     def read(self, message: Message, peer: str, arrival: float, connected: bool) -> Reading | None:
         """Return the reading of a message, as `MessageReader`; None after a registration that is not the scenario's."""
-        if isinstance(message, TransformMessage) and message.name == self._image:
+        if isinstance(message, TransformMessage) and message.name == self._image and not self._in_pixels:
             self._wrong = self._find_difference(message)
             return None
         reading = super().read(message, peer, arrival, connected)
@@ -80,8 +82,12 @@ class PointsReader(MessageReader[Reading]):
             points = _find_points(message)
             if self._is_slice and len(points) != 1:
                 raise InputError(f"{len(points)} points: a slice has one")
+            if self._in_pixels and not isinstance(message, PointMessage):
+                raise InputError("no POINT: a view has the pixels of points")
         except InputError as error:
             return Reading(time - self._delay, (), str(error))
+        if self._in_pixels:
+            return Reading(time - self._delay, tuple((x, y) for x, y, _ in points), *[] if points else ["no points"])
         return Reading(time - self._delay, *read_points(points, lambda point: to_needle(self._own, point)))
 
 
@@ -113,8 +119,8 @@ def make_sensor(
 
     Raises RigError for invalid settings or a kind without points, RunError if the port is taken.
     """
-    if not isinstance(sensor, Points | Slice):
-        raise RigError(f'{sensor.title} of the scenario has kind = "{sensor.kind}": must be points or slice')
+    if not isinstance(sensor, Points | Slice | View):
+        raise RigError(f'{sensor.title} of the scenario has kind = "{sensor.kind}": must be points, slice or view')
     given = check_settings(IgtlSensorSettings, settings)
     reader = PointsReader(given, sensor, None if scenario is None else registration_of(scenario))
     return IgtlSensor(given, reader, clock, find_late_s(given.late_ms, sensor.rate_hz))

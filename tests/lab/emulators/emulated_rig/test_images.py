@@ -1,6 +1,7 @@
 """The images of an emulated rig without processes: messages of points, and the rig file of their driver."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from flexneedle.scenario.files import load_scenario
 RIG = load_rig("emulated")
 SLICE = {"kind": "slice", "name": "lower", "plane_mm": 12.0}
 POINTS = {"kind": "points", "to_mm": 20.0}
+VIEW = {"kind": "view", "to_mm": 20.0, "projection": [[9.0, 0, 0, 0], [0, 9.0, 0, 0], [0, 0, 0, 1.0]]}
 HALF_TURN = ImageRegistration((0.0, 0.0, 0.0, 1.0), (5.0, 6.0, 7.0))
 
 
@@ -60,7 +62,16 @@ def test_a_sensor_of_the_rig_file_that_does_not_read_what_is_sent_is_refused(key
         address_of_images(job_of(SLICE, POINTS, rig=RigFile.model_validate(values)))
 
 
+def test_a_view_has_the_pixels_of_its_points():
+    (view,) = job_of(VIEW).images
+    reader = PointsReader(IgtlSensorSettings(device="view", stamps=False), view, HALF_TURN)
+    sent = to_message("view", ((100.0, 20.0), (math.nan, math.nan), (140.0, 21.5)), HALF_TURN.inverse())
+    assert reader.read(sent, "peer", 1.0, connected=False).rows == ((100.0, 20.0), (140.0, 21.5))
+    assert make_job(RIG, job_of(SLICE, VIEW).scenario, None, 0, None, ()).images[1].title == "view"
+
+
 def test_a_kind_without_an_emulated_device_is_refused():
-    view = {"kind": "view", "to_mm": 20.0, "projection": [[9.0, 0, 0, 0], [0, 9.0, 0, 0], [0, 0, 0, 1.0]]}
-    with pytest.raises(InputError, match='sensor view: kind = "view": must be fbg, slice or points'):
-        make_job(RIG, job_of(SLICE, view).scenario, None, 0, None, ())
+    own = SimpleNamespace(title="own", kind="own:Own")
+    scenario = job_of(SLICE).scenario.model_copy(update={"sensor": (own,)})
+    with pytest.raises(InputError, match='sensor own: kind = "own:Own": must be fbg, slice, points or view'):
+        make_job(RIG, scenario, None, 0, None, ())

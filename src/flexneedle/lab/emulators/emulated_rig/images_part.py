@@ -1,7 +1,8 @@
 """Images of an emulated rig: a process with an OpenIGTLink server of points of the phantom.
 
 `python -m flexneedle.lab.emulators.emulated_rig.images_part PARENT PHANTOM`, with descriptors of channels. Each sensor
-`slice` or `points` of the scenario is a device, whose POINT messages have the errors and faults of the virtual sensor.
+`slice`, `points` or `view` of the scenario is a device, whose POINT messages have the errors and faults of the virtual
+sensor.
 """
 
 import asyncio
@@ -66,8 +67,15 @@ async def _serve(job: EmulationJob, parent: Parent, sensors: Mapping[str, Virtua
 
 
 def to_message(name: str, rows: Matrix, to_image: Rigid) -> PointMessage:
-    """Return the message of a reading x, y, z (mm), without stamp; points that are not measured are left out."""
-    places = to_image.apply(np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 3))
+    """Return the message of a reading, without stamp; points that are not measured are left out.
+
+    rows: x, y, z (mm) in the frame of the insertion, or column and row of pixels.
+    """
+    known = [row for row in rows if np.isfinite(row).all()]
+    if known and len(known[0]) == 2:
+        places = np.pad(np.array(known), ((0, 0), (0, 1)))
+    else:
+        places = to_image.apply(np.array(known).reshape(-1, 3))
     named = (NamedPoint(name=str(k), position=(x, y, z)) for k, (x, y, z) in enumerate(places.tolist()))
     return PointMessage(name=name, points=tuple(named))
 

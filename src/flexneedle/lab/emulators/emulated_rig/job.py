@@ -12,6 +12,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.fbg import Fbg
 from flexneedle.scenario.sensors.points import Points
 from flexneedle.scenario.sensors.slice import Slice
+from flexneedle.scenario.sensors.view import View
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class EmulationJob:
         return next((one for one in self.scenario.sensor if isinstance(one, Fbg)), None)
 
     @property
-    def images(self) -> tuple[Slice | Points, ...]:
+    def images(self) -> tuple[Slice | Points | View, ...]:
         """The sensors along the needle that images are."""
-        return tuple(one for one in self.scenario.sensor if isinstance(one, Slice | Points))
+        return tuple(one for one in self.scenario.sensor if isinstance(one, Slice | Points | View))
 
     def faults_of(self, device: str) -> list[str]:
         """Return the texts of the scheduled faults of a device."""
@@ -81,10 +82,9 @@ def make_job(
     if sum(isinstance(one, Fbg) for one in scenario.sensor) > 1:
         raise InputError("sensor: an emulated rig has one sensor of kind fbg; leave the others out")
     for one in scenario.sensor:
-        if not isinstance(one, Fbg | Slice | Points):
-            raise InputError(
-                f'sensor {one.title}: kind = "{one.kind}": must be fbg, slice or points to be emulated; leave it out'
-            )
+        if not isinstance(one, Fbg | Slice | Points | View):
+            rule = "must be fbg, slice, points or view to be emulated; leave it out"
+            raise InputError(f'sensor {one.title}: kind = "{one.kind}": {rule}')
     if job.fibre is None and job.faults_of("fbgs"):
         raise InputError("--fault fbgs: the scenario has no sensor of kind fbg")
     return job
