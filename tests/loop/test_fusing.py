@@ -9,10 +9,10 @@ import pytest
 import flexneedle
 from flexneedle.estimation.along import Comparison
 from flexneedle.estimation.faults import Fault
-from flexneedle.loop.fusing import judge_faults
+from flexneedle.loop.fusing import Watch, is_sensed, judge_faults
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.loop.virtual import Seeds, virtual_rig
-from flexneedle.types import Reading, VerdictKind
+from flexneedle.types import Reading, Verdict, VerdictKind
 
 FBG = {"kind": "fbg", "sites_mm": [11, 26, 70, 105]}
 SLICES = [{"kind": "slice", "name": f"slice {k}", "plane_mm": x} for k, x in ((1, 12.0), (2, 25.0))]
@@ -121,6 +121,16 @@ def test_without_a_tracker_the_needle_moves_only_after_a_reading():
     assert insertion.outcome == "held"
     assert "no good reading of any sensor yet" in insertion.reason
     assert all(period.applied.db_x == 0.0 for period in insertion.periods)
+
+
+def test_a_slow_sensor_measures_between_its_readings():
+    scenario = planned()[0].with_values({"sensor": [SLICES[0] | {"rate_hz": 2.0}]})
+    watch = Watch({"slice 1": SensorMonitor(heard=10.0)})
+    assert is_sensed(scenario, watch, 10.8)
+    assert not is_sensed(scenario, watch, 11.0)
+    assert not is_sensed(
+        scenario, Watch({"slice 1": SensorMonitor(heard=10.0, excluded=Verdict(VerdictKind.FROZEN))}), 10.1
+    )
 
 
 def test_images_that_the_needle_has_not_come_to_yet_are_no_loss():

@@ -87,7 +87,9 @@ class PointsReader(MessageReader[Reading]):
         except InputError as error:
             return Reading(time - self._delay, (), str(error))
         if self._in_pixels:
-            return Reading(time - self._delay, tuple((x, y) for x, y, _ in points), *[] if points else ["no points"])
+            return Reading(
+                time - self._delay, tuple((x, y) for x, y, _ in points), *[] if points else ["no points"]
+            )
         return Reading(time - self._delay, *read_points(points, lambda point: to_needle(self._own, point)))
 
 
@@ -120,7 +122,9 @@ def make_sensor(
     Raises RigError for invalid settings or a kind without points, RunError if the port is taken.
     """
     if not isinstance(sensor, Points | Slice | View):
-        raise RigError(f'{sensor.title} of the scenario has kind = "{sensor.kind}": must be points, slice or view')
+        raise RigError(
+            f'{sensor.title} of the scenario has kind = "{sensor.kind}": must be points, slice or view'
+        )
     given = check_settings(IgtlSensorSettings, settings)
     reader = PointsReader(given, sensor, None if scenario is None else registration_of(scenario))
     return IgtlSensor(given, reader, clock, find_late_s(given.late_ms, sensor.rate_hz))
