@@ -178,6 +178,7 @@ calibration: setup  ## fits of 100 sets of simulated recordings, and 50 closed l
 
 sensors: setup  ## insertions with sensors along the needle, healthy and faulty, in 140 random worlds (hours)
 	$(BIN)/python studies/sensors.py --out $(OUT) $(call quick,--worlds 100001 1 --unguided 0 --rows "lost$(comma) fbg")
+	$(BIN)/python studies/sensor_check.py $(call quick,--worlds 100000 1)
 
 wide: setup  ## 200 random worlds from soft tissue to stiff gel with four controllers, and the report (DIR=runs/wide; hours)
 	$(call study,wide,$(OUT))
