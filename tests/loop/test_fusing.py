@@ -192,15 +192,15 @@ def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
 @pytest.mark.parametrize(
     ("odds", "faulty", "held"),
     [
-        ({"tracker": 2.0, "fbg": 8.0}, "", False),
-        ({"tracker": 2.0, "fbg": 10.0}, "fbg", False),
-        ({"tracker": 9.0, "fbg": 13.0}, "fbg", False),
+        ({"tracker": 2.0, "fbg": 14.0}, "", False),
+        ({"tracker": 2.0, "fbg": 16.0}, "fbg", False),
+        ({"tracker": 12.0, "fbg": 16.0}, "fbg", False),
         ({"tracker": 5.0, "fbg": 6.0}, "", True),  # one of them
         ({"tracker": 3.5, "fbg": 6.9}, "", False),  # more likely the fibre
         ({"tracker": 5.0, "fbg": 0.5}, "tracker", True),
-        ({"tracker": 1.0, "a": 2.0, "b": 10.0}, "b", False),
+        ({"tracker": 1.0, "a": 2.0, "b": 16.0}, "b", False),
         ({"tracker": 5.0}, "tracker", True),
-        ({"fbg": 10.0}, "fbg", False),
+        ({"fbg": 16.0}, "fbg", False),
         ({}, "", False),
     ],
 )

@@ -22,7 +22,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_FAULTY = 9.0  # log odds (natural) of a fault of a sensor, from which it is excluded
+_FAULTY = 15.0  # log odds (natural) of a fault of a sensor, from which it is excluded
 _IN_DOUBT = 3.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
 _CLEAR = 3.0  # by which a fault must be likelier than another
 _MOVES = 2  # after which faults are searched again: the newest readings are averaged over two
