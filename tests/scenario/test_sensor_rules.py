@@ -59,6 +59,18 @@ def test_settings_without_effect_have_a_line(changes, key):
     assert line.startswith(f"{key} = ")
 
 
+def test_a_fibre_alone_needs_sites_no_farther_apart_than_the_needle_bends():
+    alone = {"tracker.enabled": False, "control.start_axial_sd_mm": 0.0, "target.depth_mm": 70.0}
+    thin = alone | {"needle": {"outer_diameter_mm": 0.5, "youngs_modulus_gpa": 60.0, "length_mm": 150.0}}
+    few = {"sensor": [{"kind": "fbg", "sites_mm": [10.0, 60.0]}]}
+    (line,) = find_doubts(PHANTOM.with_values(thin | few))
+    assert line.startswith("sensor[0].sites_mm: 50 mm of the inserted needle without a site")
+    assert not find_doubts(
+        PHANTOM.with_values(thin | {"sensor": [{"kind": "fbg", "sites_mm": [10.0, 25.0, 40.0, 55.0]}]})
+    )
+    assert not find_doubts(PHANTOM.with_values(thin | few | {"tracker.enabled": True}))
+
+
 class Offset(Sensor):
     """The lateral position at the skin, mm."""
 

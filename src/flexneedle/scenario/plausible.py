@@ -1,6 +1,8 @@
 """Valid but implausible values of a scenario: far outside the usual range, or without effect."""
 
 from collections.abc import Iterator
+from itertools import pairwise
+from statistics import fmean
 from typing import NamedTuple
 
 from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
@@ -8,6 +10,7 @@ from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import key_path
 from flexneedle.scenario.sections.zones import ImageSettings, ZoneFile
+from flexneedle.scenario.sensors.fbg import Fbg
 from flexneedle.scenario.sensors.points import Points
 from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.scenario.zone_files import find_lost
@@ -94,6 +97,7 @@ USUAL = {
 }
 """By key; * is any layer. Sources are for the ends of the range."""
 
+_SITES = 0.8  # largest distance of sites over the length over which the needle bends
 _FAR = 10**0.5  # ratio to the nearest usual value from which a value is reported: half an order of magnitude
 
 
@@ -109,6 +113,7 @@ def find_doubts(scenario: Scenario) -> list[str]:
         *_find_unused(scenario),
         *_stale(scenario),
         *_find_idle_sensors(scenario),
+        *_find_far_sites(scenario),
         *find_unplaced(scenario),
         *find_lost(scenario).values(),
     ]
@@ -161,6 +166,22 @@ def _find_idle_sensors(scenario: Scenario) -> Iterator[str]:
     if not scenario.tracker.enabled and control.start_axial_sd_mm:
         rule = "without a tracker this error of the depth remains: home the tip, and set it to what is left"
         yield f"control.start_axial_sd_mm = {control.start_axial_sd_mm:g}: {rule}"
+
+
+def _find_far_sites(scenario: Scenario) -> Iterator[str]:
+    """Yield a line for fibres alone whose sites are too far apart to show the shape of the needle in the tissue.
+
+    The needle bends over 1/β, β⁴ = k/(4EI), as a beam on an elastic foundation.
+    """
+    foundation = fmean(2.0 * layer.energy_per_mm(1.0) for layer in scenario.tissue)
+    bends = (4.0 * scenario.needle.bending_stiffness / foundation) ** 0.25
+    for k, sensor in enumerate(scenario.sensor if not scenario.tracker.enabled else ()):
+        if isinstance(sensor, Fbg):
+            depth = scenario.target.depth_mm
+            ends = [0.0, *(site for site in sensor.sites_mm if site < depth), depth]
+            if (gap := max(b - a for a, b in pairwise(ends))) > _SITES * bends:
+                rule = f"{gap:.0f} mm of the inserted needle without a site; it bends over {bends:.0f} mm"
+                yield f"sensor[{k}].sites_mm: {rule}: the tip is known better with at most {_SITES * bends:.0f} mm"
 
 
 def find_unplaced(scenario: Scenario) -> Iterator[str]:
