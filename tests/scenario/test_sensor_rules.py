@@ -22,6 +22,7 @@ REFUSED = [
     ({"tracker.enabled": False}, "tracker.enabled = false"),
     ({"sensor": [{"kind": "fbg", "sites_mm": [10.0, 149.0]}]}, "sensor[0].sites_mm = 149.0"),
     ({"sensor": [SLICE | {"plane_mm": 81.5}]}, "sensor[0].plane_mm = 81.5"),
+    ({"sensor": [SLICE | {"normal": [0.1, 1.0, 0.0]}]}, "sensor[0].normal = [0.1, 1.0, 0.0]"),
     ({"sensor": [SLICE | {"plane_mm": -180.0}]}, "sensor[0].plane_mm = -180.0"),
     ({"sensor": [POINTS | {"from_mm": 90.0, "to_mm": 99.0}]}, "sensor[0].from_mm = 90.0"),
     ({"sensor": [POINTS | {"to_mm": -1.0}]}, "sensor[0].to_mm = -1.0"),

@@ -175,10 +175,10 @@ def check_silent(scenario: Scenario, watch: Watch, now: float) -> Verdict:
     least = min(_silence(scenario, watch, now), now - watch.of(TRACKER).heard)
     if least <= scenario.control.stale_after_s:
         return OK
-    since = (
-        f"for {least:.2f} s, limit {scenario.control.stale_after_s:.2f} s" if math.isfinite(least) else "yet"
-    )
-    reason = f"no good reading of any sensor {since}"
+    limit = scenario.control.stale_after_s
+    since = f" for {least:.2f} s, limit {limit:.2f} s" if math.isfinite(least) else ""
+    excluded = [f"{name}: {one.excluded}" for name, one in watch.monitors.items() if not one.excluded.ok]
+    reason = "; ".join([f"no good reading of any sensor{since}", *excluded])
     return Verdict(VerdictKind.MISSING, reason)
 
 

@@ -163,9 +163,23 @@ def _find_idle_sensors(scenario: Scenario) -> Iterator[str]:
     control = scenario.control
     if control.essential_points and not any(isinstance(one, Slice | Points) for one in scenario.sensor):
         yield 'control.essential_points = true: has no effect without a [[sensor]] "points" or "slice"'
+    yield from _find_unknown_bias(scenario)
     if not scenario.tracker.enabled and control.start_axial_sd_mm:
         rule = "without a tracker this error of the depth remains: home the tip, and set it to what is left"
         yield f"control.start_axial_sd_mm = {control.start_axial_sd_mm:g}: {rule}"
+
+
+def _find_unknown_bias(scenario: Scenario) -> Iterator[str]:
+    """Yield a line if a constant error of the tracker and an error of the start cannot be separated."""
+    given, start = scenario.tracker.bias_sd_mm, scenario.control.start_axial_sd_mm
+    if not given:
+        return
+    placed = scenario.setup.has_guide or any(not sensor.rolls for sensor in scenario.sensor)
+    if not placed:
+        yield f"tracker.bias_sd_mm = {given:g}: without a guide only a sensor with a position shows it, such as a slice"
+    if start:
+        rule = "along the needle it cannot be separated from tracker.bias_sd_mm: home the tip, and set it to what is left"
+        yield f"control.start_axial_sd_mm = {start:g}: {rule}"
 
 
 def _find_far_sites(scenario: Scenario) -> Iterator[str]:

@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, field_validator
 
 from flexneedle.scenario.sections.environment import Direction
 from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     Flags = NDArray[np.bool_]
 
 _MODEL_MM = 0.03
+_MOST_TILT_DEG = 80.0
 
 
 class PlaneErrors(SensorErrors):
@@ -56,6 +57,14 @@ class Slice(KeyedSensor):
     phantom: PlaneErrors = PlaneErrors()
     _shift: Any = PrivateAttr((0.0, 0.0, 0.0))  # of the true image (mm)
     _turn: Any = PrivateAttr((0.0, 0.0, 0.0))  # its rotation vector (rad)
+
+    @field_validator("normal")
+    @classmethod
+    def _crosses(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
+        angle = math.degrees(math.acos(min(1.0, abs(normal[0]) / math.hypot(*normal))))
+        if angle > _MOST_TILT_DEG:
+            raise ValueError(f"must be at most {_MOST_TILT_DEG:g}° from x, not {angle:.1f}°")
+        return normal
 
     @cached_property
     def frame(self) -> "Floats":

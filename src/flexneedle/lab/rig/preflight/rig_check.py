@@ -289,11 +289,16 @@ def check_sensor(
     measured = [one for one in readings if any(isfinite(value) for row in one.rows for value in row)]
     rows = [", ".join(f"{value:.4g}" for value in row) for one in measured[-1:] for row in one.rows]
     few = 2 * len(measured) <= len(readings)
-    reason = f"in less than half of the readings: {readings[-1].status if readings else 'no reading'}"
+    said = readings[-1].status if readings else "no reading"
+    values = Finding(
+        name, "values", "; ".join(rows) or "none", f"in less than half of the readings: {said}" * few
+    )
+    if readings and not measured and type(wanted).sees is not Sensor.sees:
+        values = UncheckedFinding(name, "values", f"none, as of an image without the needle: {said}")
     return [
         Finding(name, "readings", f"{rate:.1f} Hz", f"rate_hz of the scenario is {wanted.rate_hz:g}" * slow),
         Finding(name, "status", status, "must be ok while readings arrive" * (status != VISIBLE)),
-        Finding(name, "values", "; ".join(rows) or "none", reason * few),
+        values,
     ]
 
 
