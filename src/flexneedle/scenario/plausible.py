@@ -178,7 +178,9 @@ def _find_unknown_bias(scenario: Scenario) -> Iterator[str]:
     if not placed:
         yield f"tracker.bias_sd_mm = {given:g}: without a guide only a sensor with a position shows it, such as a slice"
     if start:
-        rule = "along the needle it cannot be separated from tracker.bias_sd_mm: home the tip, set what is left"
+        rule = (
+            "along the needle it cannot be separated from tracker.bias_sd_mm: home the tip, set what is left"
+        )
         yield f"control.start_axial_sd_mm = {start:g}: {rule}"
 
 
