@@ -6,17 +6,15 @@ from dataclasses import replace
 import pytest
 
 import flexneedle
+from flexneedle.loop.fusing import Watch
 from flexneedle.loop.measuring import Observation, observe, observe_before_start
 from flexneedle.loop.monitor.monitor import Monitor
+from flexneedle.loop.monitor.sensors import SensorMonitor
 from flexneedle.types import (
     VISIBLE,
-    CheckedReading,
     Frame,
     Measurement,
-    Reading,
     SensorReading,
-    SensorState,
-    Verdict,
 )
 
 OK = "ok"
@@ -249,6 +247,8 @@ class Fusing(AtRest):
 
 
 def test_only_a_sensor_that_corrects_the_estimate_measures_the_needle():
-    sensors = (SensorState("fbg", (CheckedReading(Reading(1.0, ((1e-3,),)), Verdict()),)),)
+    scenario = SCENARIO.with_values({"sensor": [{"kind": "fbg", "sites_mm": [11.0]}]})
+    watch = Watch({"fbg": SensorMonitor(heard=1.0)})
     for estimate, sensed in ((Fusing(), True), (AtRest(), False)):
-        assert Observation(estimate, Monitor(SCENARIO.monitor), sensors=sensors).sensed is sensed
+        observation = Observation(estimate, Monitor(scenario.monitor), watch=watch)
+        assert observation.sensed_at(scenario, 1.1) is sensed
