@@ -103,7 +103,8 @@ def test_an_exclusion_is_marked_where_it_happened():
     ]
     assert list(state_changes(SENSED, "slice")) == []
     (panel,) = axes(drawn(), "innovations")
-    assert [text.get_text() for text in panel.texts] == ["fbg: frozen: 20 identical readings while …"]
+    found = [" ".join(text.get_text().split()) for text in panel.texts]
+    assert found == ["fbg: frozen: 20 identical readings while …"]
     assert FROZEN.startswith("frozen: 20 identical")
 
 

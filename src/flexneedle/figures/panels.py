@@ -1,5 +1,6 @@
 """Panels over the depth of the tip or over time: lines that end in a dot, with their names beside the panel."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ from flexneedle.types import Floats
 _ANGLES = (15, 30, 45, 90, 180, 360, 720, 1440)  # distances of ticks at angles (degrees)
 _TICKS = 4
 _POINTS = ("o", "x")  # styles of lines that are points
+_MARK = 36  # characters of a line of the text of a mark, which fits in half a panel
 _ROW, _HANDLE = 56, 6  # characters: of a line of names above a panel, of the mark of a name
 ENERGY = "Energy stored in the tissue (µJ), ◇ peak"
 _FEW = 4  # names that fit beside a panel
@@ -125,17 +127,20 @@ def _draw_panel(ax: Axes, scenario: Scenario, panel: DepthPanel) -> None:
 
 def _draw_marks(ax: Axes, marks: Sequence[Mark]) -> None:
     """Draw a vertical line at each mark, its text beside it, towards the middle."""
-    middle = np.mean(ax.get_xlim())
-    for number, mark in enumerate(marks):
+    middle, above = np.mean(ax.get_xlim()), 0
+    for mark in marks:
+        rows = textwrap.wrap(mark.text, _MARK)
         ax.axvline(mark.x, color=mark.color, linewidth=1.0, zorder=2)
         side = -1 if mark.x > middle else 1
         how: dict[str, Any] = {
-            "xytext": (3 * side, -9 * number - 2),
+            "xytext": (3 * side, -9 * above - 2),
             "textcoords": "offset points",
             "zorder": 4,
         }
         how |= {"va": "top", "ha": "left" if side > 0 else "right", "color": mark.color, "fontsize": small()}
-        made = ax.annotate(mark.text, (mark.x, 1.0), xycoords=ax.get_xaxis_transform(), bbox=BOX, **how)
+        at = (mark.x, 1.0)
+        made = ax.annotate("\n".join(rows), at, xycoords=ax.get_xaxis_transform(), bbox=BOX, **how)
+        above += len(rows)
         made.set_in_layout(False)  # a long one would make the panels narrow
 
 
