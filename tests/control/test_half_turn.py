@@ -8,7 +8,7 @@ import pytest
 
 import flexneedle
 from adaptive import ADAPTIVE, PHANTOM
-from flexneedle.control.controllers import adaptive_mpc
+from flexneedle.control.half_turn import DONE, may_turn, turn_in_air
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.control import Limits, limit_half_turn
 from flexneedle.simulator.simulator import Simulator
@@ -28,9 +28,9 @@ def test_the_needle_returns_and_keeps_its_limits(changes, roll):
     roll = 0.0 if scenario.setup.half_turns else roll
     plan = replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=scenario, roll=roll)
     task = task_of(Simulator(scenario, threads=1), plan)
-    memory, angle, steps = ADAPTIVE.begin(task), roll, []
-    while memory.turns < adaptive_mpc._DONE:
-        decision, memory = adaptive_mpc._turn_in_air(task, memory, angle)
+    step, angle, steps = 0, roll, []
+    while step < DONE:
+        decision, step = turn_in_air(task, step, angle)
         Limits.of(scenario).check(np.zeros(7), np.array([decision.command]), angle)
         turn = decision.command.roll
         if scenario.setup.half_turns:
@@ -65,9 +65,9 @@ def test_a_turn_that_ends_a_little_short_is_done():
     task = task_of(
         Simulator(SPACE, threads=1), replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=SPACE)
     )
-    memory, angle, rolls = ADAPTIVE.begin(task), 0.0, 0
-    while memory.turns < adaptive_mpc._DONE:
-        decision, memory = adaptive_mpc._turn_in_air(task, memory, angle)
+    step, angle, rolls = 0, 0.0, 0
+    while step < DONE:
+        decision, step = turn_in_air(task, step, angle)
         angle += 0.99 * decision.command.roll
         rolls += decision.command.roll != 0.0
     assert rolls == 2
@@ -82,7 +82,7 @@ def test_without_a_tracker_there_is_none():
     scenario = SPACE.with_values(changes)
     plan = replace(make_plan("manipulation", (40.0, 1.0, 0.0), 0), scenario=scenario)
     task = task_of(Simulator(scenario, threads=1), plan)
-    assert not adaptive_mpc._may_turn(task, Identification().begin(task))
+    assert not may_turn(task, Identification().begin(task))
 
 
 def test_a_tracker_without_a_constant_error_needs_none():

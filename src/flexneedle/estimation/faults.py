@@ -5,8 +5,8 @@ odds are the logarithm of its Bayes factor, of readings with and without it, by 
 the generalised likelihood ratio for a change of unknown time (Willsky and Jones, IEEE Trans. Autom. Control 21:108,
 1976), with a prior on the size of the change.
 
-After a leap of the needle the model is late. So the evidence of the tracker alone, or else
-of a sensor alone, against the model is no evidence of a fault, and is subtracted.
+After a leap of the needle the model is late. So the evidence of the tracker alone, or else of a sensor alone, against
+the model is no evidence of a fault, and is subtracted.
 
 The model's error lasts over some moves, and is correlated as e^(−moves/length). Readings are averaged over this
 number of moves, the last ones over fewer.

@@ -83,9 +83,8 @@ class Identification:
         prior, slots, along = add_sensors(prior, task)
         step = scenario.setup.max_advance_mm
         begin = scenario.setup.start_tip_x - 5 * step
-        if (
-            along or slots.bias.stop
-        ):  # room for angles of the needle in air, whatever the start along the axis
+        # Room for angles of the needle in air, whatever the start along the axis.
+        if along or slots.bias.stop:
             begin -= 4.0 * scenario.control.start_axial_sd_mm
         grid = np.arange(begin, scenario.setup.max_depth + (ROUND + 6) * step, step)
         length = scenario.needle.length_mm

@@ -73,7 +73,7 @@ class Move:
 
     @property
     def is_roll(self) -> bool:
-        """Whether it is a roll alone, which turns evenly."""
+        """True for a roll alone, which turns evenly."""
         return self.applied.roll != 0.0 and self.applied._replace(roll=0.0) == STILL
 
     @property

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from pydantic import model_validator
 
+from flexneedle.control.half_turn import DONE, may_turn, turn_in_air
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook, predict_ends
@@ -45,7 +46,7 @@ from flexneedle.scenario.sections.fields import NonNegative, Positive, count
 from flexneedle.scenario.sections.weights import drop_old_keys, with_weights
 from flexneedle.simulator.excess import LoadLimits
 from flexneedle.simulator.zones import zones_of
-from flexneedle.types import DB_X, STILL, Floats, Laterals, Shape, X, Y, Z, laterals
+from flexneedle.types import STILL, Floats, Laterals, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
 _SMOOTHING = 0.3
@@ -68,10 +69,6 @@ _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the be
 _PRICE_OF_ENERGY = 2.0
 # Intrusion into a margin up to which it is charged little: the estimate moves by about as much from period to period.
 _SOFT_MM = 0.1
-_THERE, _BACK, _DONE = 1, 2, 3  # steps of the half turn in air
-_READINGS = 20  # at each end
-_REACHED = math.radians(10.0)  # wider than what drivers allow
-_SURE = 3.0  # standard deviations by which the tip is in air
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -142,8 +139,9 @@ def decide(
     from flexneedle.control.forecast import format_miss, probability_beyond
 
     fitted = cast(Identified, estimate)  # CONTROLLER below names its observer
-    if memory.turns < _DONE and (memory.turns or _may_turn(task, fitted)):
-        return _turn_in_air(task, memory, fitted.state.roll)
+    if memory.turns < DONE and (memory.turns or may_turn(task, fitted)):
+        decision, turns = turn_in_air(task, memory.turns, fitted.state.roll)
+        return decision, replace(memory, turns=turns)
     settings = task.settings
     current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled
     ahead = Ahead.of(task, fitted.state, current)
@@ -170,33 +168,6 @@ def decide(
     )
     doubt = fitted.doubt
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples, doubt), after
-
-
-def _may_turn(task: Task, fitted: Identified) -> bool:
-    """Return if half a turn would show an error of the tracker: where it is a parameter, before the needle advances."""
-    axial = math.sqrt(fitted.tip_covariance[0, 0])
-    in_air = float(fitted.tips[-1, X]) + _SURE * axial < 0.0 and float(fitted.state.travel[DB_X]) == 0.0
-    return bool(fitted.slots.bias.stop) and task.scenario.tracker.enabled and in_air
-
-
-def _turn_in_air(task: Task, memory: Memory, roll: float) -> tuple[Decision, Memory]:
-    """Return the next step of half a turn in air, there and back, with a rest at either end; roll: the angle now (rad).
-
-    It separates a constant error of the tracker from the run-out, which turns with the needle. A turn that was not
-    carried out is repeated.
-    """
-    setup, first, why = (
-        task.scenario.setup,
-        task.plan.roll,
-        "half a turn in air, for the error of the tracker",
-    )
-    there = math.copysign(min(math.pi, setup.max_rotation + abs(first)), -first)
-    step = memory.turns or _THERE
-    left = first + (there if step == _THERE else 0.0) - roll
-    if abs(math.remainder(left, 2.0 * math.pi)) > _REACHED:
-        return Decision(STILL._replace(roll=left), why), replace(memory, turns=step)
-    rest = _READINGS * task.scenario.tracker.period
-    return Decision(STILL, why, rest=rest), replace(memory, turns=step + 1)
 
 
 def _describe_rolls(path: GuidePath, axes: int) -> str:
