@@ -80,6 +80,23 @@ def test_a_prediction_is_as_uncertain_as_the_parameters_in_the_axes_of_the_senso
     np.testing.assert_allclose(compared.covariance - model, known, atol=0.05 * np.diag(known).max())
 
 
+def test_a_shift_of_all_points_is_one_error():
+    """Stations do not average the error of a registration; sites of a fibre err each by itself."""
+    estimate, _ = followed()
+    counts = {one.name: one.slots.offset.stop - one.slots.offset.start for one in estimate.along}
+    assert counts == {"fbg": 8, "slice": 2, "points": 2}
+
+
+def test_the_tip_is_known_less_well_than_the_parameters_by_what_lasts():
+    estimate, _ = followed()
+    slope = estimate.slopes(estimate.state.tip[:1])[0]
+    slope[estimate.slots.run_out] = estimate.state.bevel * np.array([1.0, 1.0j])
+    parts = np.stack([slope.real, slope.imag])
+    more = np.trace(estimate.tip_covariance[1:, 1:] - parts @ estimate.covariance @ parts.T)
+    model = estimate.sensors[0].unexplained(estimate.nominal.scenario, estimate.settings)
+    assert more > 2.0 * model**2 * (1.0 - np.exp(-2.0 / LASTING)) - 1e-12
+
+
 def test_the_derivative_to_the_clock_is_that_of_readings_at_other_times():
     """In moves whose readings stay in them; the needle turns and bends between the ends of a move."""
     estimate, _ = followed(turn="spin")
