@@ -27,7 +27,7 @@ SPAN = 1.96  # standard deviations to either side of a 95 % interval
 
 def sensors(scenario: Any, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Return a sensor of each kind, before the skin."""
-    start, axis = scenario.setup.start_tip_x, -2.0
+    start, axis = scenario.setup.start_tip_x, max(-2.0, 0.3 * scenario.setup.start_tip_x)
     sites = np.sort(rng.uniform(8.0, 0.9 * min(120.0, scenario.needle.length_mm), 4))
     span = {"from_mm": start + 0.25 * (axis - start), "to_mm": axis}
     pixels = [[10.0, 0.0, 0.0, 500.0], [0.0, 7.0, 7.0, 500.0], [0.0, 0.0, 0.0, 1.0]]

@@ -10,7 +10,6 @@ from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed, print_json
 from flexneedle.cli.progress import print_line
-from flexneedle.cli.values import make_number_type
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 from flexneedle.lab.commands.rig_parts import add_yes, print_findings
 from flexneedle.loop.events import AllGates, Gate, Stream
@@ -58,13 +57,6 @@ def _add_check(commands: Commands) -> None:
     add_seed(parser, "seed of the virtual phantom and its sensors")
     parser.add_argument("--sensor", metavar="NAME", help="only this sensor (default: all of the scenario)")
     parser.add_argument(
-        "--rounds",
-        type=make_number_type(int, 1, 20),
-        default=1,
-        metavar="N",
-        help="times of all motions, for slow sensors (default: 1)",
-    )
-    parser.add_argument(
         "--out", type=expand_home, metavar="DIR", help=f"write {_RESULT} and a figure to this folder"
     )
     parser.add_argument("--json", action="store_true", help="print the errors as one JSON object")
@@ -81,7 +73,7 @@ def _check(args: argparse.Namespace) -> int:
     scenario, rig = load_scenario(args.scenario), None
     names = choose_sensors(scenario, args.sensor)
     if args.rig is None:
-        run = run_on(VirtualRig(), scenario, args.seed, Stream(), args.rounds)
+        run = run_on(VirtualRig(), scenario, args.seed, Stream())
     else:
         from flexneedle.lab.rig.supervised import SupervisedRig
 
@@ -117,15 +109,15 @@ def _run_on_rig(args: argparse.Namespace, source: SupervisedRig, scenario: Scena
         interrupt_on_signals(stack)
         ros = source.file.ros
         bridges = () if ros is None else (stack.enter_context(Bridge(ros, print_line)),)
-        gate = AllGates(*bridges, _UserGate(scenario, args.rounds, yes=args.yes))
-        return run_on(source, scenario, args.seed, Stream(bridges, gate), args.rounds)
+        gate = AllGates(*bridges, _UserGate(scenario, yes=args.yes))
+        return run_on(source, scenario, args.seed, Stream(bridges, gate))
 
 
 class _UserGate(Gate):
     """Prints the motions, and asks before motors move."""
 
-    def __init__(self, scenario: Scenario, rounds: int, *, yes: bool) -> None:
-        self._scenario, self._rounds, self._yes = scenario, rounds, yes
+    def __init__(self, scenario: Scenario, *, yes: bool) -> None:
+        self._scenario, self._yes = scenario, yes
 
     def confirm(self, rig: Any) -> None:
         """Ask. Raises RunError for any answer but yes."""
@@ -134,7 +126,7 @@ class _UserGate(Gate):
 
         rig.take_signals()
         lines = [
-            *describe_motions(self._scenario, self._rounds),
+            *describe_motions(self._scenario),
             *describe_axes(rig.rig, rig.positions),
             ARMS,
         ]

@@ -10,7 +10,7 @@ from flexneedle.lab.rig.rig_file import SensorSection, load_rig
 from flexneedle.lab.rig.sensor_check.air_fit import fit_in_air
 from flexneedle.lab.rig.sensor_check.air_run import run_in_air
 from flexneedle.lab.rig.sensor_check.findings import find_errors, lines_to_paste
-from flexneedle.lab.rig.sensor_check.motions import plan_motions
+from flexneedle.lab.rig.sensor_check.motions import motion_time, plan_motions
 from flexneedle.lab.rig.sensor_check.picture import draw_check
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.scenario.worlds import world
@@ -83,6 +83,19 @@ def test_delays_of_all_kinds_are_found_on_an_exact_needle_and_what_is_in_tissue_
     assert list(found) == ["all"]
     assert "measures nothing" in found["all"].finding.found
     assert len(draw_check(fit).axes) == 4  # two panels each of the two that measure
+
+
+def test_the_guide_sweeps_until_the_delay_of_a_slow_image_is_found():
+    scenario = world(100_003, "real", "two-axes")
+    image = {"kind": "slice", "plane_mm": 0.5 * (scenario.setup.start_tip_x - 2.0)}
+    fit, ports = virtual_fit(
+        scenario.with_values({"sensor": [{**image, "rate_hz": 5.0, "phantom": {"clock_s": 0.1}}]}), 10
+    )
+    value, sd = fit.clock(0)
+    assert value == pytest.approx(ports["slice"]._clock, abs=0.01)
+    assert 0.002 < sd < 0.005  # 4 ms were asked for
+    rare = scenario.with_values({"sensor": [{**image, "rate_hz": 0.1}]})
+    assert 300.0 < motion_time(rare, plan_motions(rare)) < 600.0
 
 
 @pytest.mark.parametrize(("number", "rig", "found"), [(3, "plane", True), (0, "no-guide", False)])

@@ -24,14 +24,14 @@ def choose_sensors(scenario: Scenario, name: str | None) -> list[str]:
     return names if name is None else [name]
 
 
-def run_on(source: RigSource, scenario: Scenario, seed: int, stream: Stream, rounds: int = 1) -> AirRun:
-    """Carry out the motions in air on a rig, `rounds` times.
+def run_on(source: RigSource, scenario: Scenario, seed: int, stream: Stream) -> AirRun:
+    """Carry out the motions in air on a rig.
 
     Raises as `RigSource.open`, RunError and DriverError as `run_in_air`.
     """
     # The supervisor stops an advance at the plan's end and what may follow: here within the margin before the skin.
     scenario = scenario.with_values({"guard.past_target_mm": 0.5 * air_margin(scenario)})
-    motions = plan_motions(scenario) * rounds
+    motions = plan_motions(scenario)
     with source.open(scenario, _plan_in_air(scenario, np.array(motions)), seed, stream) as rig:
         return run_in_air(scenario, rig, motions)
 
@@ -59,7 +59,7 @@ def _plan_in_air(scenario: Scenario, rows: np.ndarray) -> Plan:
     )
 
 
-def describe_motions(scenario: Scenario, rounds: int) -> Sequence[str]:
+def describe_motions(scenario: Scenario) -> Sequence[str]:
     """Return lines on what will move, for its confirmation."""
     setup, reach, along = scenario.setup, lateral_reach(scenario), advance_in_air(scenario)
     part, count = ("guide", setup.moved_guide_axes) if setup.has_guide else ("base", setup.axes)
@@ -69,6 +69,7 @@ def describe_motions(scenario: Scenario, rounds: int) -> Sequence[str]:
         *lines,
         f"rotation: {turned} and back, twice",
         f"insertion: {along:.1f} mm forward, to {air_margin(scenario):.1f} mm before the skin, and back",
-        f"All of this {rounds} times, in about {rounds * motion_time(scenario, plan_motions(scenario)):.0f} s.",
+        *[f"There {part}_y sweeps from side to side, for slow sensors many times."] * (reach > 0.0),
+        f"All of this in about {motion_time(scenario, plan_motions(scenario)):.0f} s.",
         "Only with the needle in air, free by these distances.",
     ]

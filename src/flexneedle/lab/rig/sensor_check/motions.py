@@ -1,17 +1,22 @@
 """Motions in air that show the errors of sensors along the needle. Pure functions.
 
 With a guide the needle bends between clamp and guide: the guide moves to both sides on each of its axes, the needle
-rolls with the guide off the axis, and advances and withdraws within the gap to the skin. Without a guide nothing bends
-it: the base moves to the side, if the plan may move it, and the needle rolls.
+rolls with the guide off the axis, and advances and withdraws within the gap to the skin. Before it withdraws the guide
+sweeps from side to side, until the slowest sensor shows its delay. Without a guide nothing bends the needle: the base
+moves to the side, if the plan may move it, and the needle rolls.
 """
 
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from flexneedle.lab.rig.preflight.start import air_margin
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sensors.sensor import predict_values
 from flexneedle.simulator.control import roll_time, travel_time
-from flexneedle.types import STILL, Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import STILL, Control, Needles
 
 REST_S = 0.5
 """Time at rest between motions."""
@@ -19,6 +24,8 @@ _MOST_STRAIN = 2e-3  # of the needle's surface, below the yield of steel
 _MOST_TILT = 0.08  # rad, at the guide: a model of small slopes is then right to 0.5 %
 _ROLL_STEP = math.radians(30.0)
 _MOST_ROLL = math.pi
+_DELAY_SD_S = 0.004  # to which sweeps show the delay of each sensor: 95 % of errors are below 10 ms
+_MOST_SWEEPING_S = 300.0
 
 
 def plan_motions(scenario: Scenario) -> tuple[Control, ...]:
@@ -53,6 +60,25 @@ def advance_in_air(scenario: Scenario) -> float:
     return min(setup.tip_to_skin_mm - air_margin(scenario), setup.stroke_mm)
 
 
+def count_sweeps(scenario: Scenario, along: Sequence[Control], across: Sequence[Control]) -> int:
+    """Return how often guide or base sweep from side to side, an even number.
+
+    While a value changes by q in T seconds, readings at rate f with noise σ give the delay to σ √(T / f) / q, by the
+    method of least squares. `along` takes the needle from its start to one side, `across` to the other one.
+    """
+    simulator, spacing = Simulator(scenario), scenario.needle.length_mm / (scenario.needle.nodes - 1)
+    rows = np.array([*along, *across])
+    shapes = simulator.rollout(simulator.start(), rows[None], limits=False, outputs=("shapes",)).shapes[0]
+    sides, axes = Needles(shapes[[len(along), -1]], spacing), scenario.setup.axes
+    duration, needed = motion_time(scenario, [one for one in across if one != STILL]), 2.0
+    for sensor in scenario.sensor:
+        change = np.diff(predict_values(sensor, sides, axes), axis=0)[0]
+        square = float(np.sum(change[sensor.sees(sides, axes).all(axis=0)] ** 2))
+        if square > 0.0:
+            needed = max(needed, sensor.noise**2 * duration / (sensor.rate_hz * square * _DELAY_SD_S**2))
+    return 2 * math.ceil(min(needed, max(2.0, _MOST_SWEEPING_S / duration)) / 2.0)
+
+
 def _motions(scenario: Scenario) -> Iterator[Control]:
     setup, reach = scenario.setup, lateral_reach(scenario)
     part, count = ("dg", setup.moved_guide_axes) if setup.has_guide else ("db", setup.axes)
@@ -64,11 +90,14 @@ def _motions(scenario: Scenario) -> Iterator[Control]:
                 yield from _steps(f"{part}_{axis}", goal, step)
     yield from _steps(f"{part}_y", reach, step)
     yield from _rolls(scenario)
-    along = advance_in_air(scenario)
-    yield from _steps("db_x", along, setup.max_advance_mm)
-    for goal in (-2.0 * reach, 2.0 * reach):  # for images of the space before the skin
-        yield from _steps(f"{part}_y", goal, step)
-    yield from _steps("db_x", -along, setup.max_advance_mm)
+    way = advance_in_air(scenario)
+    along = tuple(_steps("db_x", way, setup.max_advance_mm))
+    yield from along
+    if reach:
+        across, back = (tuple(_steps(f"{part}_y", goal, step)) for goal in (-2.0 * reach, 2.0 * reach))
+        aside = tuple(_steps(f"{part}_y", reach, step))
+        yield from (*across, *back) * (count_sweeps(scenario, (*aside, *along), across) // 2)
+    yield from _steps("db_x", -way, setup.max_advance_mm)
     yield from _steps(f"{part}_y", -reach, step)
 
 
