@@ -12,7 +12,7 @@ from flexneedle.estimation.faults import Fault
 from flexneedle.loop.fusing import Watch, is_sensed, judge_faults
 from flexneedle.loop.monitor.sensors import SensorMonitor, check_readings
 from flexneedle.loop.virtual import Seeds, virtual_rig
-from flexneedle.types import Reading, Verdict, VerdictKind
+from flexneedle.types import OK, Reading, Verdict, VerdictKind
 
 FBG = {"kind": "fbg", "sites_mm": [11, 26, 70, 105]}
 SLICES = [{"kind": "slice", "name": f"slice {k}", "plane_mm": x} for k, x in ((1, 12.0), (2, 25.0))]
@@ -190,24 +190,32 @@ def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("odds", "faulty", "held"),
+    ("odds", "error", "faulty", "held"),
     [
-        ({"tracker": 2.0, "fbg": 14.0}, "", False),
-        ({"tracker": 2.0, "fbg": 16.0}, "fbg", False),
-        ({"tracker": 12.0, "fbg": 16.0}, "fbg", False),
-        ({"tracker": 5.0, "fbg": 6.0}, "", True),  # one of them
-        ({"tracker": 3.5, "fbg": 6.9}, "", False),  # more likely the fibre
-        ({"tracker": 5.0, "fbg": 0.5}, "tracker", True),
-        ({"tracker": 1.0, "a": 2.0, "b": 16.0}, "b", False),
-        ({"tracker": 5.0}, "tracker", True),
-        ({"fbg": 16.0}, "fbg", False),
-        ({}, "", False),
+        ({"tracker": 0.5, "fbg": 14.0}, 1.0, "", False),
+        ({"tracker": 2.0, "fbg": 16.0}, 1.0, "fbg", False),
+        ({"tracker": 12.0, "fbg": 16.0}, 1.0, "fbg", False),
+        ({"tracker": 5.0, "fbg": 6.0}, 0.6, "", True),  # one of them
+        ({"tracker": 5.0, "fbg": 6.0}, 0.4, "", False),
+        ({"tracker": 1.5, "fbg": 4.9}, 0.6, "", False),  # more likely the fibre
+        ({"tracker": 5.0, "fbg": 0.5}, 0.6, "tracker", True),
+        ({"tracker": 5.0, "fbg": 0.5}, 0.4, "", False),
+        ({"tracker": 7.0, "fbg": 0.5}, 0.4, "tracker", True),
+        ({"tracker": 1.0, "a": 2.0, "b": 16.0}, 1.0, "b", False),
+        ({"fbg": 16.0}, 0.0, "fbg", False),
+        ({}, 0.0, "", False),
     ],
 )
-def test_the_faulty_sensor_is_the_one_whose_fault_is_likeliest(odds, faulty, held):
-    found, verdict = judge_faults({name: Fault(one, 0.0) for name, one in odds.items()})
+def test_the_faulty_sensor_is_the_one_whose_fault_is_likeliest(odds, error, faulty, held):
+    """A tracker that may be wrong by a quarter of the limit of 2 mm is in doubt sooner."""
+    faults = {name: Fault(one, 0.0, error) for name, one in odds.items()}
+    found, verdict = judge_faults(faults, 2.0)
     assert found == faulty
     assert (not verdict.ok) == bool(faulty or held)
+
+
+def test_a_lost_tracker_is_doubted_as_another_sensor():
+    assert judge_faults({"tracker": Fault(14.0, 0.0, 1.0), "fbg": Fault(0.0, 0.0)}, None) == ("", OK)
 
 
 def test_readings_are_checked_one_by_one():

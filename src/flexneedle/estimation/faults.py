@@ -5,8 +5,8 @@ odds are the logarithm of its Bayes factor, of readings with and without it, by 
 the generalised likelihood ratio for a change of unknown time (Willsky and Jones, IEEE Trans. Autom. Control 21:108,
 1976), with a prior on the size of the change.
 
-After a leap of the needle the model is late. So the evidence of the tracker alone, or else of a sensor alone, against
-the model is no evidence of a fault, and is subtracted.
+After a leap of the needle the model is late. So the evidence of the tracker alone against the model is no evidence of a
+fault, and is subtracted; and readings of a sensor since which no other has measured do not count.
 
 The model's error lasts over some moves, and is correlated as e^(−moves/length). Readings are averaged over this
 number of moves, the last ones over fewer.
@@ -26,16 +26,16 @@ from flexneedle.types import Flags, Floats, X
 _ONSETS_MM = (5.0, 10.0, 20.0, np.inf)  # above the tip
 _FEW = 2  # moves over which the last readings are averaged
 _DOUBT = 2.0  # factor on the model's error for faults of single values, which are as varied as this error is
-_BESIDE_MM = 10.0  # above the tip, where another sensor measured
 _GROWTH_MM = 40.0  # depth over which a fault grows
 _SIZE = 1.5  # to this many standard deviations of a sensor's noise or offset
 
 
 class Fault(NamedTuple):
-    """A fault: ln of its Bayes factor, and the depth (mm) of the tip at its onset."""
+    """A fault: ln of its Bayes factor, the depth (mm) of the tip at its onset, and the expected error now, all values."""
 
     log_odds: float
     since: float
+    error: float = 0.0
 
 
 class _Rows(NamedTuple):
@@ -59,7 +59,7 @@ class _Rows(NamedTuple):
 
 def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
     """Return for the `TRACKER` and each sensor along the needle, by name, the likeliest fault."""
-    rows = {name: one for name, one in _all_rows(fitted) if one.left.size}
+    rows = _beside_others({name: one for name, one in _all_rows(fitted) if one.left.size})
     if not rows:
         return {}
     left, jacobian, variance = (
@@ -80,13 +80,25 @@ def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
         covariance[own, own] += _is_same(tip.value) * (tip.shares @ field_covariance(fitted) @ tip.shares.T)
     leap = 0.0
     if TRACKER in rows:
-        leap = _find_alone(fitted, TRACKER, rows, places, left, covariance + error)
+        own = places[TRACKER]
+        leap = _find_leap(fitted, rows[TRACKER], left[own], (covariance + error)[own, own])
     common = _compute_all(fitted, rows, places, left, covariance + error, leap, single=False)
     if all(one.is_common for one in rows.values()):
         return common
     doubted = covariance + _DOUBT**2 * error
     single = _compute_all(fitted, rows, places, left, doubted, leap, single=True)
     return common | {name: max(common[name], one) for name, one in single.items()}
+
+
+def _beside_others(rows: Mapping[str, _Rows]) -> dict[str, _Rows]:
+    """Return the rows of each sensor as far as another has measured since: alone it cannot be told from a leap."""
+    newest = {name: one.move.max() for name, one in rows.items()}
+    known = {}
+    for name, one in rows.items():
+        kept = one.move <= max((move for key, move in newest.items() if key != name), default=-np.inf)
+        if kept.any():
+            known[name] = _Rows(*(part[kept] if isinstance(part, np.ndarray) else part for part in one))
+    return known
 
 
 def _compute_all(
@@ -112,27 +124,15 @@ def _compute_all(
         own, size = places[name], _size(fitted, name)
         value = one.value if single else one.value % one.across
         likeliest = _find_fault(one.depth, value, weighted[own], precision[own, own], size, depth)
-        others = [other.depth.max() for key, other in rows.items() if key != name]
-        surprise = leap
-        if name != TRACKER and max(others, default=-np.inf) < depth - _BESIDE_MM:
-            surprise = _find_alone(fitted, name, rows, places, left, covariance)
-        found[name] = likeliest._replace(log_odds=likeliest.log_odds - surprise)
+        found[name] = likeliest._replace(log_odds=likeliest.log_odds - leap)
     return found
 
 
-def _find_alone(
-    fitted: FittedInsertion,
-    name: str,
-    rows: Mapping[str, _Rows],
-    places: Mapping[str, slice],
-    left: Floats,
-    covariance: Floats,
-) -> float:
-    """Return the log odds of a fault of all values of a sensor together by its own readings, at least 0."""
-    one, own = rows[name], places[name]
-    precision = np.linalg.inv(covariance[own, own]).astype(np.float64)
-    size, depth = _size(fitted, name), float(fitted.tips[-1, X])
-    found = _find_fault(one.depth, one.value % one.across, precision @ left[own], precision, size, depth)
+def _find_leap(fitted: FittedInsertion, tip: _Rows, left: Floats, covariance: Floats) -> float:
+    """Return the log odds of a fault of the tracker by its own residuals (n,), at least 0."""
+    precision = np.linalg.inv(covariance).astype(np.float64)
+    size, depth = _size(fitted, TRACKER), float(fitted.tips[-1, X])
+    found = _find_fault(tip.depth, tip.value, precision @ left, precision, size, depth)
     return max(0.0, found.log_odds)
 
 
@@ -158,9 +158,10 @@ def _find_fault(
             inner = precision[np.ix_(late, late)]
             steps = np.unique(way)
             walk = np.sqrt(np.diff(steps, prepend=0.0)) * (way[:, None] >= steps)
+            newest = places[late] == places[late].max()
             for growth in (walk, way[:, None]):
-                odds = _compute_log_odds(size * _spread(growth, value[late]), weighted[late], inner)
-                found.append(Fault(odds, since))
+                odds, error = _compare(size * _spread(growth, value[late]), weighted[late], inner)
+                found.append(Fault(odds, since, float(np.linalg.norm(error[newest]))))
         if since == 0.0:
             break
     return max(found)
@@ -173,11 +174,15 @@ def _spread(growth: Floats, values: NDArray[np.intp]) -> Floats:
     return spread
 
 
-def _compute_log_odds(root: Floats, weighted: Floats, precision: Floats) -> float:
-    """Return ln of the ratio of the densities of residuals with an error of covariance root rootᵀ, and without."""
+def _compare(root: Floats, weighted: Floats, precision: Floats) -> tuple[float, Floats]:
+    """Return ln of the ratio of the densities of residuals with an error of covariance root rootᵀ, and without.
+
+    The second value is the error (n,) that is expected with it.
+    """
     lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ precision @ root)
     known = np.linalg.solve(lower, root.T @ weighted)
-    return float(0.5 * known @ known - np.log(np.diag(lower)).sum())
+    odds = float(0.5 * known @ known - np.log(np.diag(lower)).sum())
+    return odds, root @ np.linalg.solve(lower.T, known)
 
 
 def _size(fitted: FittedInsertion, name: str) -> float:

@@ -1,7 +1,7 @@
 """Sensors along the needle in the closed loop: read, checked, excluded where they contradict the others.
 
-A sensor that contradicts the others is excluded, and the insertion is fitted again without its last readings. If it is
-the tracker, or it is not clear which one is wrong, the needle is held.
+A sensor that contradicts the others, still after a further advance, is excluded, and the insertion is fitted again without
+its last readings. If it is the tracker, or it is not clear which one is wrong, the needle is held.
 """
 
 import math
@@ -23,7 +23,9 @@ from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
 _FAULTY = 15.0  # log odds (natural) of a fault of a sensor, from which it is excluded
-_IN_DOUBT = 3.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
+_IN_DOUBT = 6.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
+_LARGE = 0.25  # over the miss limit: a tracker with an error as large is in doubt from `_LIKELY` on
+_LIKELY = 1.0
 _CLEAR = 3.0  # by which a fault must be likelier than another
 _MOVES = 2  # after which faults are searched again: the newest readings are averaged over two
 
@@ -34,6 +36,7 @@ class Watch:
 
     monitors: Mapping[str, SensorMonitor] = field(default_factory=dict)
     judged: int = 0  # number of moves when nothing was in doubt
+    suspect: tuple[str, float] = ("", 0.0)  # sensor whose fault is to be confirmed, and the depth (mm) where it was found
 
     def of(self, name: str) -> SensorMonitor:
         """Return the monitor of a sensor."""
@@ -125,19 +128,25 @@ def exclude_faulty(
     if len(estimate.moves) - watch.judged < _MOVES:
         return estimate, watch, tuple(states), OK
     faults = {name: one for name, one in estimate.faults().items() if watch.of(name).excluded.ok}
-    faulty, verdict = judge_faults(faults, _IN_DOUBT if estimate.tracked else _FAULTY)
+    miss_limit = estimate.nominal.scenario.control.miss_limit_mm
+    faulty, verdict = judge_faults(faults, miss_limit if estimate.tracked else None)
     if faulty in ("", TRACKER):
         judged = len(estimate.moves) if verdict.ok else watch.judged
-        return estimate, replace(watch, judged=judged), tuple(states), verdict
+        return estimate, replace(watch, judged=judged, suspect=NO_WATCH.suspect), tuple(states), verdict
+    name, found = watch.suspect
+    if name != faulty:
+        return estimate, replace(watch, suspect=(faulty, depth)), tuple(states), OK
+    if depth < found + estimate.nominal.scenario.setup.max_advance_mm:  # the fit may still follow a leap
+        return estimate, watch, tuple(states), OK
     watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
     after = tuple(replace(one, verdict=verdict) if one.name == faulty else one for one in states)
     return estimate.without(faulty, _time_of_depth(estimate, faults[faulty].since)), watch, after, OK
 
 
-def judge_faults(faults: Mapping[str, Fault], in_doubt: float = _IN_DOUBT) -> tuple[str, Verdict]:
+def judge_faults(faults: Mapping[str, Fault], miss_limit: float | None) -> tuple[str, Verdict]:
     """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
 
-    faults: the likeliest of each sensor by name; in_doubt: limit of the tracker's log odds.
+    faults: the likeliest of each sensor by name; miss_limit (mm): None if the tracker is lost.
     """
     odds = {name: one.log_odds for name, one in faults.items()}
     tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
@@ -146,8 +155,10 @@ def judge_faults(faults: Mapping[str, Fault], in_doubt: float = _IN_DOUBT) -> tu
         return name, Verdict(
             VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:.1f}"
         )
-    if tip > in_doubt and most - tip < _CLEAR:
-        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {in_doubt:.1f}"
+    error = faults[TRACKER].error if TRACKER in faults else 0.0
+    limit = _FAULTY if miss_limit is None else _LIKELY if error > _LARGE * miss_limit else _IN_DOUBT
+    if tip > limit and most - tip < _CLEAR:
+        reason = f"{TRACKER}: log odds of an error of {error:.1f} mm {tip:.1f}, limit {limit:.1f}"
         if tip - most > _CLEAR:
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
         return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
