@@ -143,14 +143,17 @@ def judge_faults(faults: Mapping[str, Fault], in_doubt: float = _IN_DOUBT) -> tu
     tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
     name = max(odds, key=lambda name: odds[name], default="")
     if most > _FAULTY and most - tip > _CLEAR:
-        return name, Verdict(
-            VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:.1f}"
-        )
+        reason = f"by the other sensors and the model (log odds of an error {most:.1f}, limit {_FAULTY:.1f})"
+        return name, Verdict(VerdictKind.CONTRADICTED, reason)
     if tip > in_doubt and most - tip < _CLEAR:
-        reason = f"{TRACKER}: log odds of an error {tip:.1f}, limit {in_doubt:.1f}"
+        limit = f"limit {in_doubt:.1f}"
         if tip - most > _CLEAR:
+            reason = f"{TRACKER}, by the other sensors (log odds of an error {tip:.1f}, {limit})"
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
-        return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
+        reason = (
+            f"{TRACKER} or {name}, not clear which (log odds of an error {tip:.1f} and {most:.1f}, {limit})"
+        )
+        return "", Verdict(VerdictKind.CONTRADICTED, reason)
     return "", OK
 
 
