@@ -115,6 +115,12 @@ WRONG = [
     ({"size": lambda *_: 0}, "size must"),
     ({"rolls": True}, "paired"),
     ({"model_error": lambda *_: np.array([-1.0])}, "model_error must"),
+    (
+        {"sees": lambda _, n, __: np.ones(len(n.poses), dtype=bool)},
+        "`sees` must return flags of the shape (3, 1)",
+    ),
+    ({"sees": lambda _, n, __: np.full((len(n.poses), 1), 0.5)}, "not float64"),
+    ({"predict": lambda _, n, __: np.negative(n.poses, out=n.poses)[:, -1, [Y]]}, "must not be changed"),
 ]
 
 
