@@ -98,14 +98,26 @@ def test_innovations_are_over_the_depth_with_their_mean():
 
 
 def test_an_exclusion_is_marked_where_it_happened():
-    assert list(state_changes(SENSED, "fbg")) == [
-        (SENSED.periods[EXCLUDED_FROM].estimate.x, "fbg: frozen: 20 identical readings while …")
-    ]
+    assert list(state_changes(SENSED, "fbg")) == [(SENSED.periods[EXCLUDED_FROM].estimate.x, FROZEN)]
     assert list(state_changes(SENSED, "slice")) == []
     (panel,) = axes(drawn(), "innovations")
     found = [" ".join(text.get_text().split()) for text in panel.texts]
     assert found == ["fbg: frozen: 20 identical readings while …"]
     assert FROZEN.startswith("frozen: 20 identical")
+
+
+def test_eleven_sensors_with_long_names_have_room():
+    """Names that are alike where they are cut have numbers, and the panel is as high as the names beside it."""
+    names_of = [f"ultrasound slice number {k} of the probe" for k in range(11)]
+    sensors = [{"kind": "slice", "name": name, "plane_mm": 2.0 + 3 * k} for k, name in enumerate(names_of)]
+    states = [[replace(one.sensors[1], name=name) for name in names_of] for one in SENSED.periods]
+    pairs = zip(SENSED.periods, states, strict=True)
+    periods = tuple(replace(one, sensors=tuple(each)) for one, each in pairs)
+    figure = insertion_figure(SCENARIO.with_values({"sensor": sensors}), replace(SENSED, periods=periods))
+    panel, scene = axes(figure, "innovations", "scene")
+    assert len(set(names(panel.get_legend()))) == 11
+    assert panel.get_legend().get_window_extent().y0 >= panel.get_window_extent().y0
+    assert scene.get_window_extent().width > 0.5 * figure.bbox.width
 
 
 def test_crossings_of_the_last_seconds_are_drawn_beside_the_needle():

@@ -63,6 +63,23 @@ def test_a_sensor_that_is_used_again_is_not_excluded():
     assert twice.excluded_mm == SENSED.periods[3].estimate.x
 
 
+@pytest.mark.parametrize("last", [2, None], ids=["lost", "used"])
+def test_a_sensor_is_silent_from_its_last_good_reading_on(last):
+    """A fibre of 100 Hz: readings a period old are stale with `control.stale_after_s` = 0.1."""
+    scenario = flexneedle.load_scenario("phantom").with_values(
+        {"sensor": [{"kind": "fbg", "sites_mm": [11]}], "control.stale_after_s": 0.1}
+    )
+    periods = []
+    for k, one in enumerate(SENSED.periods):
+        good = () if last is not None and k > last else (replace(GOOD, reading=Reading(one.time, ((1.0,),))),)
+        periods.append(replace(one, sensors=(replace(one.sensors[0], readings=(*good, MISSING)),)))
+    (found,) = sensor_results(replace(SENSED, scenario=scenario, periods=tuple(periods)))
+    if last is None:
+        assert math.isnan(found.silent_mm)
+    else:
+        assert found.silent_mm == SENSED.periods[last].estimate.x
+
+
 def test_a_result_has_sensors_only_with_sensors():
     assert set(insertion_result(make_insertion())) == set(RESULT_KEYS)
     found = insertion_result(SENSED)

@@ -85,8 +85,12 @@ def test_the_data_frame_has_the_same_columns():
 
 
 def test_the_table_of_readings_has_one_line_per_reading():
-    rows = rows_of(write_sensor_readings, SENSED)
+    sensors = {"sensor": [{"kind": "fbg", "sites_mm": [11, 26]}, {"kind": "slice", "plane_mm": 20.0}]}
+    insertion = replace(SENSED, scenario=SENSED.scenario.with_values(sensors))
+    rows = rows_of(write_sensor_readings, insertion)
     assert len(rows) == 2 * len(SENSED.periods)
+    assert [row["unit"] for row in rows[:2]] == ["1/mm", "mm"]
+    assert rows_of(write_sensor_readings, replace(SENSED, scenario=None))[0]["unit"] == ""
     bent, missed = rows[:2]
     assert (bent["sensor"], bent["verdict"], bent["rows"]) == ("fbg", "ok", f"0.001 -0.0; nan {1 / 3e3!r}")
     assert (missed["status"], missed["verdict"], missed["rows"]) == ("no needle", "missing: no needle", "")

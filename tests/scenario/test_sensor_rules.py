@@ -26,6 +26,7 @@ REFUSED = [
     ({"sensor": [SLICE | {"plane_mm": -180.0}]}, "sensor[0].plane_mm = -180.0"),
     ({"sensor": [POINTS | {"from_mm": 90.0, "to_mm": 99.0}]}, "sensor[0].from_mm = 90.0"),
     ({"sensor": [POINTS | {"to_mm": -1.0}]}, "sensor[0].to_mm = -1.0"),
+    ({"sensor": [POINTS | {"from_mm": -250.0, "to_mm": -180.0}]}, "sensor[0].to_mm = -180.0"),
     ({"sensor": [SLICE, SLICE]}, 'sensor[1].name = "slice"'),
     ({"sensor": [SLICE | {"name": "tracker"}]}, 'sensor[0].name = "tracker"'),
     ({"sensor": [SLICE | {"rate_hz": 1e5}]}, "sensor[0].rate_hz = 100000.0"),
@@ -51,6 +52,8 @@ def test_sensors_that_cannot_measure_are_refused_in_one_line(changes, key):
     [
         ({"sensor": [SLICE | {"plane_mm": 40.0}]}, "sensor[0].plane_mm"),
         ({"sensor": [POINTS | {"from_mm": 40.0, "to_mm": 50.0}]}, "sensor[0].from_mm"),
+        ({"sensor": [SLICE | {"rate_hz": 0.07}]}, "sensor[0].rate_hz"),  # 68.5 mm at 5 mm/s: 13.7 s
+        ({"sensor": [SLICE | {"delay_s": 13.8}]}, "sensor[0].delay_s"),
         ({"control.essential_points": True}, "control.essential_points"),
         ({"tracker.enabled": False, "sensor": [SLICE]}, "control.start_axial_sd_mm"),
     ],
@@ -58,6 +61,10 @@ def test_sensors_that_cannot_measure_are_refused_in_one_line(changes, key):
 def test_settings_without_effect_have_a_line(changes, key):
     (line,) = find_doubts(PHANTOM.with_values(changes))
     assert line.startswith(f"{key} = ")
+
+
+def test_a_sensor_in_time_for_one_reading_raises_no_doubt():
+    assert not find_doubts(PHANTOM.with_values({"sensor": [SLICE | {"rate_hz": 0.08, "delay_s": 13.6}]}))
 
 
 def test_a_fibre_alone_needs_sites_no_farther_apart_than_the_needle_bends():
@@ -108,6 +115,12 @@ WRONG = [
     ({"size": lambda *_: 0}, "size must"),
     ({"rolls": True}, "paired"),
     ({"model_error": lambda *_: np.array([-1.0])}, "model_error must"),
+    (
+        {"sees": lambda _, n, __: np.ones(len(n.poses), dtype=bool)},
+        "`sees` must return flags of the shape (3, 1)",
+    ),
+    ({"sees": lambda _, n, __: np.full((len(n.poses), 1), 0.5)}, "not float64"),
+    ({"predict": lambda _, n, __: np.negative(n.poses, out=n.poses)[:, -1, [Y]]}, "must not be changed"),
 ]
 
 

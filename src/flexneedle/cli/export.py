@@ -41,6 +41,8 @@ square of the innovation, 1 on average) and NAME.verdict.
                                   why the sensor has no value
   rows                            what it measured, rows of numbers as
                                   flexneedle.devices.Reading
+  unit                            unit of rows: 1/mm, mm, px; empty for a kind
+                                  without one
 Unknown values are empty. A tracker without frames has no sensor columns. A dry
 run adds a last column dry_run, an insertion disturbed on the page (serve) a
 column disturbed.

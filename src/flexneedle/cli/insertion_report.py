@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isnan
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.common import (
@@ -105,13 +106,15 @@ def _tip_sd(insertion: Insertion) -> list[tuple[str, str]]:
 
 
 def _sensors(insertion: Insertion) -> Iterator[tuple[str, str]]:
-    """Yield the row of each sensor along the needle, followed by its exclusion."""
+    """Yield the row of each sensor along the needle, followed by its exclusion or loss."""
     from flexneedle.record.sensor_results import sensor_results
 
     for one in sensor_results(insertion):
         yield f"sensor {one.name}", one.summary
         if one.excluded:
             yield f"  excluded {one.excluded_mm:.1f} mm deep", one.excluded
+        elif not isnan(one.silent_mm):
+            yield "  no good reading", f"since {one.silent_mm:.1f} mm deep"
 
 
 def _clearance(scenario: Scenario, insertion: Insertion) -> Iterator[tuple[str, str]]:

@@ -24,7 +24,7 @@ from flexneedle.types import Floats, X
 
 _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 _LONG = 0.5  # mm; shorter paths would be hidden below their ends
-_TALL = 1.3  # height of a panel of sensors, over the other panels
+_TALL, _ROWS = 1.3, 6  # height of a panel of sensors, over the other panels, and the names that fit beside it
 _LINES = {1: 92, 2: 60}  # characters of a line of the verdict, by the number of lateral axes
 
 
@@ -33,8 +33,9 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)
     shown = _panels(scenario, insertion)
     sensed = sensors.sensor_panels(scenario, insertion)
+    tall = {name: _TALL * max(1.0, panel.named / _ROWS) for name, panel in sensed.items()}
     with apply_style():
-        figure, axes = _sheet(scenario, insertion, list(shown), list(sensed), field=len(field) > 0)
+        figure, axes = _sheet(scenario, insertion, list(shown), tall, field=len(field) > 0)
         sections = scene.sections(scenario)
         scenes = [axes[f"scene{end}"] for end in sections]
         for ax, view in zip(scenes, sections.values(), strict=True):
@@ -68,7 +69,7 @@ def _panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
 
 
 def _sheet(
-    scenario: Scenario, insertion: Insertion, panels: list[str], sensed: list[str], *, field: bool
+    scenario: Scenario, insertion: Insertion, panels: list[str], sensed: dict[str, float], *, field: bool
 ) -> tuple[Figure, dict[str, Axes]]:
     if scenario.setup.axes == 1:
         scenes = [["scene", "scene"]]
@@ -81,10 +82,12 @@ def _sheet(
         heights, widths, tall = [1.6, 1.6], space.COLUMNS, 2.8
     alone = [*sensed, *(["field"] if field else [])]
     rows = [*scenes, *below, *([name, *["."] * (len(widths) - 1)] for name in alone)]
-    heights = heights + [1.0] * len(below) + [_TALL if name in sensed else 1.0 for name in alone]
+    heights = heights + [1.0] * len(below) + [sensed.get(name, 1.0) for name in alone]
     target = f"target {scene.place(scenario, insertion.target)}"
     title = f"{short(scenario.name, 60)}: {target} (seed {insertion.seed}){zones.name_lost(scenario)}"
-    return mosaic(title, tall + 1.15 * (len(rows) + (_TALL - 1.0) * len(sensed)), rows, heights, widths)
+    return mosaic(
+        title, tall + 1.15 * (len(rows) + sum(sensed.values()) - len(sensed)), rows, heights, widths
+    )
 
 
 def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:

@@ -17,7 +17,7 @@ from flexneedle.types import Floats
 _ANGLES = (15, 30, 45, 90, 180, 360, 720, 1440)  # distances of ticks at angles (degrees)
 _TICKS = 4
 _POINTS = ("o", "x")  # styles of lines that are points
-_MARK = 36  # characters of a line of the text of a mark, which fits in half a panel
+_MARK = 30  # characters of a line of the text of a mark, which fits in half a panel
 _ROW, _HANDLE = 56, 6  # characters: of a line of names above a panel, of the mark of a name
 ENERGY = "Energy stored in the tissue (µJ), ◇ peak"
 _FEW = 4  # names that fit beside a panel
@@ -74,6 +74,11 @@ class DepthPanel:
     bands: Sequence[Band] = ()
     marks: Sequence[Mark] = ()
     log: bool = False
+
+    @property
+    def named(self) -> int:
+        """Number of lines with a name."""
+        return sum(not line.name.startswith("_") for line in self.lines)
 
 
 def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthPanel]) -> None:

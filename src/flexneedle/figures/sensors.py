@@ -27,6 +27,8 @@ _BAND = 1.96
 _SHOWN_S = 2.0  # before the end: readings beside the needle as it is drawn
 _MOST_SITES = 6
 _REASON = 44  # characters
+_NAME = 16  # characters of a sensor's name
+_NAMED = 4  # sensors that are named one by one beside the needle
 _LEAST_NIS = 0.02
 _TURNED = 0.3  # rad; readings of a period with a larger turn are at several angles
 
@@ -39,12 +41,21 @@ def sensor_panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPa
     if is_column() or not any(period.sensors for period in insertion.periods):
         return {}
     fibres = [sensor for sensor in scenario.sensor if isinstance(sensor, Fbg)]
-    curvatures = {
-        f"{sensor.title}{end}": _curvatures(scenario, insertion, sensor, end, axis - Y)
-        for sensor in fibres
-        for end, (_, axis) in sections(scenario).items()
-    }
+    names = short_names([sensor.title for sensor in scenario.sensor])
+    curvatures = {}
+    for sensor in fibres:
+        for end, (_, axis) in sections(scenario).items():
+            title = f"{names[sensor.title]}: curvature{end} by site (1/m), ● measured"
+            panel = DepthPanel(title, _curvatures(scenario, insertion, sensor, axis - Y), 0.2)
+            curvatures[f"{sensor.title}{end}"] = panel
     return curvatures | {"innovations": _innovations(insertion)}
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return sensors' names cut to the room in a figure, with their numbers where they are then alike."""
+    cut = {name: short(name, _NAME) for name in names}
+    alike = [name for name, text in cut.items() if list(cut.values()).count(text) > 1]
+    return cut | {name: f"{short(name, _NAME - 3)} {alike.index(name) + 1}" for name in alike}
 
 
 def tip_bands(scenario: Scenario, insertion: Insertion) -> list[Band]:
@@ -82,30 +93,32 @@ def draw_tip_region(ax: Axes, insertion: Insertion, view: View, *, band: bool = 
 def draw_points(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:
     """Draw image planes, and the points that sensors measured in the last seconds, from the side."""
     since = insertion.periods[-1].time - _SHOWN_S
+    shown = [one.title for one in scenario.sensor if isinstance(one, Slice | Points)]
+    names = short_names(shown) if len(shown) <= _NAMED else dict.fromkeys(shown, "sensors")
     for number, sensor in enumerate(scenario.sensor):
         if not isinstance(sensor, Slice | Points):
             continue
         color = look(number).color
         if isinstance(sensor, Slice):
-            _draw_plane(ax, sensor, view, color)
+            _draw_plane(ax, sensor, view, color, f"{names[sensor.title]}, plane")
         states = (state for period in insertion.periods for state in _states(period, sensor))
         good = [one for state in states for one in state.good if one.time >= since]
         rows = np.array([row for one in good for row in one.rows]).reshape(-1, 3)
         how: dict[str, Any] = {"markersize": 2.4, "alpha": 0.6, "zorder": 5.5}
         if len(rows):
-            label = f"{sensor.title}, last {_SHOWN_S:g} s"
+            label = f"{names[sensor.title]}, last {_SHOWN_S:g} s"
             ax.plot(*rows[:, view].T, "o", color=color, label=label, **how)
 
 
-def _draw_plane(ax: Axes, sensor: Slice, view: View, color: str) -> None:
+def _draw_plane(ax: Axes, sensor: Slice, view: View, color: str, label: str) -> None:
     low, high = ax.get_ylim()
     slope = -sensor.frame[0, view[1]] / sensor.frame[0, X]
     ends = [sensor.plane_mm + slope * low, sensor.plane_mm + slope * high]
-    ax.plot(ends, [low, high], ":", color=color, linewidth=0.9, zorder=2.1, label=f"{sensor.title}, plane")
+    ax.plot(ends, [low, high], ":", color=color, linewidth=0.9, zorder=2.1, label=label)
     ax.set_ylim(low, high)
 
 
-def _curvatures(scenario: Scenario, insertion: Insertion, sensor: Fbg, end: str, axis: int) -> DepthPanel:
+def _curvatures(scenario: Scenario, insertion: Insertion, sensor: Fbg, axis: int) -> list[Line]:
     """Return curvatures of sites as measured and of the estimated needle, in the stage's axes."""
     axes, sites = scenario.setup.axes, sensor.sites_mm
     depth = estimated_path(insertion)[:, X]
@@ -118,7 +131,7 @@ def _curvatures(scenario: Scenario, insertion: Insertion, sensor: Fbg, end: str,
         color, column = look(rank).color, site * axes + axis
         lines.append(Line(f"{sites[site]:g} mm", depth, predicted[:, column], color))
         lines.append(Line("_measured", depth, measured[:, column], color, "o"))
-    return DepthPanel(f"{sensor.title}: curvature{end} by site (1/m), ● measured", lines, 0.2)
+    return lines
 
 
 def _spread(count: int) -> list[int]:
@@ -143,14 +156,17 @@ def _mean(period: Period, sensor: Sensor, axes: int) -> Floats:
 def _innovations(insertion: Insertion) -> DepthPanel:
     """Return the normalised square of each sensor's innovation, its mean over some periods, and exclusions."""
     names = list(dict.fromkeys(state.name for period in insertion.periods for state in period.sensors))
-    lines, marks = [], []
-    for number, name in enumerate(names):
+    lines, marks = list[Line](), list[Mark]()
+    for number, (name, shown) in enumerate(short_names(names).items()):
         color, (depth, nis, ok) = look(number).color, _innovations_of(insertion, name)
         used = ok > 0.0
-        lines.append(Line(name, depth, _running_mean(nis), color))
+        style = "--" if color in (line.color for line in lines) else "-"
+        lines.append(Line(shown, depth, _running_mean(nis), color, style))
         lines.append(Line("_used", depth[used], nis[used], color, "o"))
         lines.append(Line("_excluded", depth[~used], nis[~used], color, "x"))
-        marks += [Mark(at, text, color) for at, text in state_changes(insertion, name)]
+        marks += [
+            Mark(at, short(f"{shown}: {text}", _REASON), color) for at, text in state_changes(insertion, name)
+        ]
     title = f"Square of innovations (1 on average): ● used, × excluded, mean of {_WINDOW}"
     return DepthPanel(title, lines, _LEAST_NIS, marks=marks, log=True)
 
@@ -181,7 +197,7 @@ def state_changes(insertion: Insertion, name: str) -> Iterator[tuple[float, str]
         for state in period.sensors:
             kind = "" if state.verdict.ok else str(state.verdict.kind)
             if state.name == name and kind != before:
-                yield period.estimate.x, short(f"{name}: {state.verdict if kind else 'used again'}", _REASON)
+                yield period.estimate.x, str(state.verdict) if kind else "used again"
                 before = kind
 
 

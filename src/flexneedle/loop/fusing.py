@@ -36,7 +36,10 @@ class Watch:
 
     monitors: Mapping[str, SensorMonitor] = field(default_factory=dict)
     judged: int = 0  # number of moves when nothing was in doubt
-    suspect: tuple[str, float] = ("", 0.0)  # sensor whose fault is to be confirmed, and the depth (mm) where it was found
+    suspect: tuple[str, float] = (
+        "",
+        0.0,
+    )  # sensor whose fault is to be confirmed, and the depth (mm) where it was found
 
     def of(self, name: str) -> SensorMonitor:
         """Return the monitor of a sensor."""
@@ -152,16 +155,17 @@ def judge_faults(faults: Mapping[str, Fault], miss_limit: float | None) -> tuple
     tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
     name = max(odds, key=lambda name: odds[name], default="")
     if most > _FAULTY and most - tip > _CLEAR:
-        return name, Verdict(
-            VerdictKind.CONTRADICTED, f"log odds of an error {most:.1f}, limit {_FAULTY:.1f}"
-        )
+        reason = f"by the other sensors and the model (log odds of an error {most:.1f}, limit {_FAULTY:.1f})"
+        return name, Verdict(VerdictKind.CONTRADICTED, reason)
     error = faults[TRACKER].error if TRACKER in faults else 0.0
     limit = _FAULTY if miss_limit is None else _LIKELY if error > _LARGE * miss_limit else _IN_DOUBT
     if tip > limit and most - tip < _CLEAR:
-        reason = f"{TRACKER}: log odds of an error of {error:.1f} mm {tip:.1f}, limit {limit:.1f}"
+        seen = f"{error:.1f} mm {tip:.1f}"
         if tip - most > _CLEAR:
+            reason = f"{TRACKER}, by the other sensors (log odds of an error of {seen}, limit {limit:.1f})"
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
-        return "", Verdict(VerdictKind.CONTRADICTED, f"{reason}; of {name} it is {most:.1f}")
+        reason = f"{TRACKER} or {name}, not clear which (log odds of an error of {seen} and {most:.1f}, limit {limit:.1f})"
+        return "", Verdict(VerdictKind.CONTRADICTED, reason)
     return "", OK
 
 

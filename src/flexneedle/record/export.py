@@ -11,13 +11,15 @@ from flexneedle.record import readings
 from flexneedle.record.fields import COLUMNS, to_row, to_values
 from flexneedle.record.sensors import reading_values
 from flexneedle.results import Insertion, Period
+from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import SensorState
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
-_SENSOR_READING = ("time_s", "period", "sensor", "verdict", "status", "rows")
+_SENSOR_READING = ("time_s", "period", "sensor", "verdict", "status", "rows", "unit")
+_OF_ROWS = {(1e3, "1/m"): "1/mm"}  # units by factor and unit of a sensor, others by their names
 _TIP_SD = ("tip_sd_x_mm", "tip_sd_y_mm", "tip_sd_z_mm")
 _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")
 
@@ -95,14 +97,23 @@ def write_readings(file: IO[str], insertion: Insertion) -> None:
 def write_sensor_readings(file: IO[str], insertion: Insertion) -> None:
     """Write all readings of the sensors along the needle, one line per reading, to a text file opened with newline="".
 
-    The column `rows` has what was measured, as `Reading.rows`: numbers separated by spaces, rows by semicolons.
+    The column `rows` has what was measured, as `Reading.rows`: numbers separated by spaces, rows by semicolons; `unit`
+    its unit, empty for a kind without one.
     """
-    marked = mark_columns(insertion)
+    marked, scenario = mark_columns(insertion), insertion.scenario
+    units = {one.title: _unit(one) for one in (scenario.sensor if scenario else ())}
     writer = csv.DictWriter(file, [*_SENSOR_READING, *marked], lineterminator="\n")
     writer.writeheader()
     for period in insertion.periods:
         for state in period.sensors:
-            writer.writerows(row | marked for row in _reading_rows(period.index, state))
+            unit = {"unit": units.get(state.name, "")}
+            writer.writerows(row | unit | marked for row in _reading_rows(period.index, state))
+
+
+def _unit(sensor: Sensor) -> str:
+    """Return the unit of a sensor's rows."""
+    factor, name = sensor.unit
+    return _OF_ROWS.get(sensor.unit, name if factor == 1.0 else f"{factor:g} {name}")
 
 
 def _reading_rows(period: int, state: SensorState) -> Iterator[dict[str, Any]]:

@@ -7,6 +7,7 @@ from statistics import median
 from typing import Any
 
 from flexneedle.results import Insertion, Period, Plan
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.points import Points
 from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.types import Point, SensorState, VerdictKind
@@ -18,7 +19,8 @@ class SensorResult:
 
     readings: all; missing: readings without a value; rejected: share of the others that was rejected; mean_nis,
     median_nis: of its innovations while it was used, NaN without any; excluded: the last verdict, "" if it was used to
-    the end, and the depth of the tip (mm) at that time, NaN if it was used.
+    the end, and the depth of the tip (mm) at that time, NaN if it was used; silent_mm: depth of the tip (mm) since
+    which it had no good reading, NaN if the last one is not stale.
     """
 
     name: str
@@ -29,6 +31,7 @@ class SensorResult:
     median_nis: float
     excluded: str
     excluded_mm: float
+    silent_mm: float
 
     @property
     def summary(self) -> str:
@@ -101,9 +104,9 @@ def _result(insertion: Insertion, name: str) -> SensorResult:
     last, since = steps[-1][1].verdict, _excluded_mm(steps)
     rejected, nis = 1.0 - good / valid if valid else 0.0, sum(used) / len(used) if used else math.nan
     middle = median(used) if used else math.nan
-    return SensorResult(
-        name, len(verdicts), missing, rejected, nis, middle, "" if last.ok else str(last), since
-    )
+    excluded = "" if last.ok else str(last)
+    silent = _silent_mm(insertion.scenario, name, steps)
+    return SensorResult(name, len(verdicts), missing, rejected, nis, middle, excluded, since, silent)
 
 
 def _excluded_mm(steps: list[tuple[Period, SensorState]]) -> float:
@@ -112,3 +115,19 @@ def _excluded_mm(steps: list[tuple[Period, SensorState]]) -> float:
     for period, state in steps:
         since = math.nan if state.verdict.ok else period.estimate.x if math.isnan(since) else since
     return since
+
+
+def _silent_mm(scenario: Scenario | None, name: str, steps: list[tuple[Period, SensorState]]) -> float:
+    """Return the depth of the tip (mm) since which a sensor has no good reading; NaN if its last one is not stale."""
+    sensor = next((one for one in scenario.sensor if one.title == name), None) if scenario else None
+    if scenario is None or sensor is None:
+        return math.nan
+    good = [
+        (period.estimate.x, one.reading.time)
+        for period, state in steps
+        for one in state.readings
+        if one.verdict.ok
+    ]
+    depth, heard = good[-1] if good else (steps[0][0].estimate.x, -math.inf)
+    limit = scenario.control.stale_after_s + sensor.delay_s + 1.0 / sensor.rate_hz
+    return depth if steps[-1][0].time - heard > limit else math.nan

@@ -12,6 +12,7 @@ from flexneedle.scenario.problems import key_path
 from flexneedle.scenario.sections.zones import ImageSettings, ZoneFile
 from flexneedle.scenario.sensors.fbg import Fbg
 from flexneedle.scenario.sensors.points import Points
+from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.scenario.zone_files import find_lost
 
@@ -160,6 +161,7 @@ def _find_idle_sensors(scenario: Scenario) -> Iterator[str]:
             if value is not None and value >= scenario.target.depth_mm:
                 rule = f"beyond target.depth_mm ({scenario.target.depth_mm:g}): the sensor measures nothing"
                 yield f"sensor[{k}].{key} = {value:g}: {rule}"
+        yield from _find_late(f"sensor[{k}]", sensor, scenario)
     control = scenario.control
     if control.essential_points and not any(isinstance(one, Slice | Points) for one in scenario.sensor):
         yield 'control.essential_points = true: has no effect without a [[sensor]] "points" or "slice"'
@@ -167,6 +169,17 @@ def _find_idle_sensors(scenario: Scenario) -> Iterator[str]:
     if not scenario.tracker.enabled and control.start_axial_sd_mm:
         rule = "without a tracker this error of the depth remains: home the tip, and set it to what is left"
         yield f"control.start_axial_sd_mm = {control.start_axial_sd_mm:g}: {rule}"
+
+
+def _find_late(at: str, sensor: Sensor, scenario: Scenario) -> Iterator[str]:
+    """Yield a line for readings too rare or too late for the insertion."""
+    setup = scenario.setup
+    lasts = (scenario.target.depth_mm - setup.start_tip_x) / setup.insertion_speed_mm_s
+    over = f"the needle advances to the target in {_short(lasts)} s"
+    if sensor.rate_hz * lasts < 1.0:
+        yield f"{at}.rate_hz = {sensor.rate_hz:g}: a reading every {_short(1.0 / sensor.rate_hz)} s, {over}: raise it"
+    if sensor.delay_s >= lasts:
+        yield f"{at}.delay_s = {sensor.delay_s:g}: readings arrive too late, {over}: lower it, or leave the sensor out"
 
 
 def _find_unknown_bias(scenario: Scenario) -> Iterator[str]:

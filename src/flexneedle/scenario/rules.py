@@ -214,13 +214,16 @@ def sensor_problems(
 def _place_problems(at: str, sensor: Sensor, needle: Needle, setup: Setup) -> Iterator[Problem]:
     """Yield sites beyond the needle, and images that the tip never reaches."""
     reach = f"the tip goes to {setup.max_depth:g} (setup.stroke_mm - setup.tip_to_skin_mm)"
+    base = setup.start_tip_x - needle.length_mm
+    start = f"the base starts at {base:g} (setup.tip_to_skin_mm, needle.length_mm)"
     if isinstance(sensor, Fbg) and sensor.sites_mm[-1] + 0.5 * sensor.gauge_mm > needle.length_mm:
         rule = f"the last gauge must end at most {needle.length_mm:g} from the tip, at needle.length_mm"
         yield Problem(f"{at}.sites_mm", sensor.sites_mm[-1], rule)
     if isinstance(sensor, Slice) and sensor.plane_mm >= setup.max_depth:
         yield Problem(f"{at}.plane_mm", sensor.plane_mm, f"is never crossed: {reach}")
-    if isinstance(sensor, Slice) and sensor.plane_mm <= (base := setup.start_tip_x - needle.length_mm):
-        rule = f"is never crossed: the base starts at {base:g} (setup.tip_to_skin_mm, needle.length_mm)"
-        yield Problem(f"{at}.plane_mm", sensor.plane_mm, rule)
+    if isinstance(sensor, Slice) and sensor.plane_mm <= base:
+        yield Problem(f"{at}.plane_mm", sensor.plane_mm, f"is never crossed: {start}")
     if isinstance(sensor, Range) and sensor.from_mm >= setup.max_depth:
         yield Problem(f"{at}.from_mm", sensor.from_mm, f"no needle is there: {reach}")
+    if isinstance(sensor, Range) and sensor.to_mm <= base:
+        yield Problem(f"{at}.to_mm", sensor.to_mm, f"no needle is there: {start}")

@@ -210,7 +210,7 @@ def test_it_says_that_steps_are_not_used(guided):
     first, *others = guided.recordings
     bent = replace(first, slope=first.slope + np.where(np.arange(len(first.depth)) > 8, 1.0, 0.0)[:, None])
     found = calibrate("gel", replace(guided, recordings=(bent, *others)), ("bevel",))
-    assert found.notes[0].startswith("4 of 65 steps are not used: the needle has turned by more than 0.5 rad")
+    assert found.notes[0].startswith("4 of 65 steps are not used: the needle has turned by more than 29°")
 
 
 def test_a_value_that_the_recordings_contradict_is_not_kept(guided, monkeypatch):

@@ -57,8 +57,9 @@ def find_notes(found: "Calibration") -> Iterator[str]:
     )
     if used < steps:
         yield (
-            f"{steps - used} of {steps} steps are not used: the needle has turned by more than {STEEP:g} rad, too "
-            "far for the model"
+            f"{steps - used} of {steps} steps are not used: the needle has turned by more than "
+            f"{np.degrees(STEEP):.0f}°, the model's limit: use the fit up to there, or record a stiffer needle, or "
+            "smaller depths"
         )
     if len(recordings) < LEAST_RECORDINGS:
         yield f"intervals are too narrow: from fewer than {LEAST_RECORDINGS} insertions"

@@ -43,7 +43,8 @@ def broken_rule(sensor: Sensor, axes: int, length: float, depth: float) -> str:
     try:
         return _broken_rule(sensor, axes, _sample_needles(axes, length, depth))
     except Exception as error:  # noqa: BLE001 - whatever the kind of a user raises
-        return f"raises {type(error).__name__}: {make_printable(str(error))}"
+        hint = ": needles.poses must not be changed" if "read-only" in str(error) else ""
+        return f"raises {type(error).__name__}: {make_printable(str(error))}{hint}"
 
 
 def _broken_rule(sensor: Sensor, axes: int, needles: Needles) -> str:
@@ -57,6 +58,10 @@ def _broken_rule(sensor: Sensor, axes: int, needles: Needles) -> str:
     values = np.asarray(sensor.predict(needles, axes), dtype=float)
     if rule := values_rule(values, (len(needles.poses), size)):
         return f"predict {rule}"
+    seen = np.asarray(sensor.sees(needles, axes))
+    if seen.dtype != bool or seen.shape != values.shape:
+        rule = f"flags of the shape {values.shape}, needles by values, not {seen.dtype} {seen.shape}"
+        return f"`sees` must return {rule}"
     error = np.asarray(sensor.model_error(values), dtype=float)
     if error.shape != values.shape or not (error >= 0.0).all():
         return f"model_error must return an array of the shape of the values, {values.shape}, at least 0"
@@ -70,4 +75,5 @@ def _sample_needles(axes: int, length: float, depth: float) -> Needles:
     poses[..., X] = along - length + np.array([0.0, 0.0, depth])[:, None]
     for place, slope in ((Y, THETA), (Z, PSI))[:axes]:
         poses[1:, :, place], poses[1:, :, slope] = 0.5 * _BENT_PER_MM * along**2, _BENT_PER_MM * along
+    poses.setflags(write=False)
     return Needles(poses, along[1])

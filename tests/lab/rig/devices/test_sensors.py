@@ -140,7 +140,7 @@ def test_rig_check_reads_the_sensors_of_the_scenario():
         "connection": ("own:Gratings", ""),
         "readings": ("49.0 Hz", ""),
         "status": ("ok", ""),
-        "values": ("0.001, 0.002; 0.001, 0.002", ""),
+        "values": ("1, 2; 1, 2 1/m", ""),
     }
     fast = IntendedInsertion(scenario(FBG.model_copy(update={"rate_hz": 100.0})))
     problems = [one.problem for one in check_rig(rig(**kinds, sensor=[table()]), ManualClock(), 1.0, fast)]

@@ -287,12 +287,12 @@ def check_sensor(
     rate, status = len(readings) / seconds, device.status
     slow = rate < (1.0 - _RATE_TOLERANCE) * wanted.rate_hz
     measured = [one for one in readings if any(isfinite(value) for row in one.rows for value in row)]
-    rows = [", ".join(f"{value:.4g}" for value in row) for one in measured[-1:] for row in one.rows]
+    factor, unit = wanted.unit
+    rows = [", ".join(f"{factor * value:.4g}" for value in row) for one in measured[-1:] for row in one.rows]
+    shown = f"{'; '.join(rows)} {unit}".rstrip() if rows else "none"
     few = 2 * len(measured) <= len(readings)
     said = readings[-1].status if readings else "no reading"
-    values = Finding(
-        name, "values", "; ".join(rows) or "none", f"in less than half of the readings: {said}" * few
-    )
+    values = Finding(name, "values", shown, f"in less than half of the readings: {said}" * few)
     if readings and not measured and type(wanted).sees is not Sensor.sees:
         values = UncheckedFinding(name, "values", f"none, as of an image without the needle: {said}")
     return [

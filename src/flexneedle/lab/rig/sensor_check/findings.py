@@ -18,7 +18,8 @@ from flexneedle.types import VISIBLE, Reading
 _SDS = 3.0  # standard deviations by which an error may be off
 _UNKNOWN = 0.5  # share of the prior's standard deviation from which an error is not found
 _LEAST = {"delay": 0.005, "gain": 0.005, "roll offset": 0.004}  # errors that never matter (s, 1, rad)
-_NOISE, _RATE, _LOST = 1.5, 1.1, 0.05  # largest ratios, and largest share
+_NOISE, _RATE = 1.5, 1.1  # largest ratios
+_FEW = 0.02  # share of lost or outlying readings that never matters
 _CORRECTS = ("fbgs", "interrogator", "ros")  # devices with `MountingSettings`
 
 
@@ -184,11 +185,18 @@ class _SensorCheck:
         line = "" if 1.0 / _RATE < rate / sensor.rate_hz < _RATE else f"rate_hz = {rate:.3g}"
         yield self._error("rate", rate, 0.0, "Hz", f"{sensor.rate_hz:g}", "", line)
         lost = float(np.mean([one.status != VISIBLE for one in self._readings]))
-        share = sensor.phantom.missing_fraction
-        line = f"phantom.missing_fraction = {lost:.2g}" if lost > max(_LOST, 2.0 * share) else ""
-        outlying = 1.0 - self._fit.used[number].sum() / np.isfinite(self._one.value).sum()
-        note = f"{100.0 * outlying:.2g} % of the values are outliers"
-        yield self._error("lost", 100.0 * lost, 0.0, "%", f"{100.0 * share:.3g}", note, line)
+        yield self._share("lost", lost, len(times), "missing_fraction")
+        known = np.isfinite(self._one.value)
+        count, outlying = (int(one.any(axis=1).sum()) for one in (known, known & ~self._fit.used[number]))
+        yield self._share("outliers", outlying / count, count, "outlier_fraction")
+
+    def _share(self, item: str, found: float, count: int, key: str) -> SensorError:
+        """Return the share of `count` readings, off beyond three standard deviations of a count by chance."""
+        share = float(getattr(self._sensor.phantom, key))
+        most = max(share, _FEW)
+        is_off = found > most + _SDS * math.sqrt(most * (1.0 - most) / count)
+        line = f"phantom.{key} = {found:.2g}" if is_off else ""
+        return self._error(item, 100.0 * found, 0.0, "%", f"{100.0 * share:.3g}", "", line)
 
 
 def lines_to_paste(errors: Sequence[SensorError]) -> list[str]:
