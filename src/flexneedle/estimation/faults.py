@@ -26,12 +26,13 @@ from flexneedle.types import Flags, Floats, X
 _ONSETS_MM = (5.0, 10.0, 20.0, np.inf)  # above the tip
 _FEW = 2  # moves over which the last readings are averaged
 _DOUBT = 2.0  # factor on the model's error for faults of single values, which are as varied as this error is
+_ROUNDING = 1e-9  # of mean numbers of moves
 _GROWTH_MM = 40.0  # depth over which a fault grows
 _SIZE = 1.5  # to this many standard deviations of a sensor's noise or offset
 
 
 class Fault(NamedTuple):
-    """A fault: ln of its Bayes factor, the depth (mm) of the tip at its onset, and the expected error now, all values."""
+    """A fault: ln of its Bayes factor, the depth (mm) of the tip at its onset, and the expected error now."""
 
     log_odds: float
     since: float
@@ -95,7 +96,8 @@ def _beside_others(rows: Mapping[str, _Rows]) -> dict[str, _Rows]:
     newest = {name: one.move.max() for name, one in rows.items()}
     known = {}
     for name, one in rows.items():
-        kept = one.move <= max((move for key, move in newest.items() if key != name), default=-np.inf)
+        others = max((move for key, move in newest.items() if key != name), default=-np.inf)
+        kept = one.move < others + 0.5 * _FEW + _ROUNDING
         if kept.any():
             known[name] = _Rows(*(part[kept] if isinstance(part, np.ndarray) else part for part in one))
     return known

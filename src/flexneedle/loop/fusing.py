@@ -1,7 +1,7 @@
 """Sensors along the needle in the closed loop: read, checked, excluded where they contradict the others.
 
-A sensor that contradicts the others, still after a further advance, is excluded, and the insertion is fitted again without
-its last readings. If it is the tracker, or it is not clear which one is wrong, the needle is held.
+A sensor that contradicts the others, still after a further advance, is excluded, and the insertion is fitted again
+without its last readings. If it is the tracker, or it is not clear which one is wrong, the needle is held.
 """
 
 import math
@@ -22,7 +22,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
-_FAULTY = 15.0  # log odds (natural) of a fault of a sensor, from which it is excluded
+_FAULTY = 9.0  # log odds (natural) of a fault of a sensor, from which it is excluded
 _IN_DOUBT = 6.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
 _LARGE = 0.25  # over the miss limit: a tracker with an error as large is in doubt from `_LIKELY` on
 _LIKELY = 1.0
@@ -160,11 +160,11 @@ def judge_faults(faults: Mapping[str, Fault], miss_limit: float | None) -> tuple
     error = faults[TRACKER].error if TRACKER in faults else 0.0
     limit = _FAULTY if miss_limit is None else _LIKELY if error > _LARGE * miss_limit else _IN_DOUBT
     if tip > limit and most - tip < _CLEAR:
-        seen = f"{error:.1f} mm {tip:.1f}"
+        seen, against = f"log odds of an error of {error:.1f} mm {tip:.1f}", f"limit {limit:.1f}"
         if tip - most > _CLEAR:
-            reason = f"{TRACKER}, by the other sensors (log odds of an error of {seen}, limit {limit:.1f})"
+            reason = f"{TRACKER}, by the other sensors ({seen}, {against})"
             return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
-        reason = f"{TRACKER} or {name}, not clear which (log odds of an error of {seen} and {most:.1f}, limit {limit:.1f})"
+        reason = f"{TRACKER} or {name}, not clear which ({seen} and {most:.1f}, {against})"
         return "", Verdict(VerdictKind.CONTRADICTED, reason)
     return "", OK
 
