@@ -200,8 +200,8 @@ def test_a_rig_without_a_sensor_of_the_scenario_is_refused():
         ({"tracker": 5.0, "fbg": 6.0}, 0.4, "", False),
         ({"tracker": 1.5, "fbg": 4.9}, 0.6, "", False),  # more likely the fibre
         ({"tracker": 5.0, "fbg": 0.5}, 0.6, "tracker", True),
-        ({"tracker": 5.0, "fbg": 0.5}, 0.4, "", False),
-        ({"tracker": 7.0, "fbg": 0.5}, 0.4, "tracker", True),
+        ({"tracker": 14.0, "fbg": 0.5}, 0.4, "", False),
+        ({"tracker": 16.0, "fbg": 0.5}, 0.4, "tracker", True),
         ({"tracker": 1.0, "a": 2.0, "b": 10.0}, 1.0, "b", False),
         ({"fbg": 10.0}, 0.0, "fbg", False),
         ({}, 0.0, "", False),
@@ -248,7 +248,7 @@ def test_a_sensor_is_excluded_if_its_fault_is_still_likely_after_a_further_advan
 
 
 def test_a_lost_tracker_is_doubted_as_another_sensor():
-    assert judge_faults({"tracker": Fault(8.0, 0.0, 1.0), "fbg": Fault(0.0, 0.0)}, None) == ("", OK)
+    assert judge_faults({"tracker": Fault(14.0, 0.0, 1.0), "fbg": Fault(0.0, 0.0)}, None) == ("", OK)
 
 
 def test_readings_are_checked_one_by_one():

@@ -23,8 +23,8 @@ from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.types import OK, VISIBLE, Needles, SensorState, Verdict, VerdictKind, X
 
 _FAULTY = 9.0  # log odds (natural) of a fault of a sensor, from which it is excluded
-_IN_DOUBT = 6.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
-_LARGE = 0.25  # over the miss limit: a tracker with an error as large is in doubt from `_LIKELY` on
+_IN_DOUBT = 15.0  # of a fault of the tracker, from which the needle is held: a hold may be wrong
+_LARGE = 0.25  # over the miss limit: with an error as large it is held from `_LIKELY` on
 _LIKELY = 1.0
 _CLEAR = 3.0  # by which a fault must be likelier than another
 _MOVES = 2  # after which faults are searched again: the newest readings are averaged over two
@@ -158,7 +158,8 @@ def judge_faults(faults: Mapping[str, Fault], miss_limit: float | None) -> tuple
         reason = f"by the other sensors and the model (log odds of an error {most:.1f}, limit {_FAULTY:.1f})"
         return name, Verdict(VerdictKind.CONTRADICTED, reason)
     error = faults[TRACKER].error if TRACKER in faults else 0.0
-    limit = _FAULTY if miss_limit is None else _LIKELY if error > _LARGE * miss_limit else _IN_DOUBT
+    is_large = miss_limit is not None and error > _LARGE * miss_limit
+    limit = _LIKELY if is_large else _IN_DOUBT
     if tip > limit and most - tip < _CLEAR:
         seen, against = f"log odds of an error of {error:.1f} mm {tip:.1f}", f"limit {limit:.1f}"
         if tip - most > _CLEAR:
