@@ -216,7 +216,7 @@ def test_the_faulty_sensor_is_the_one_whose_fault_is_likeliest(odds, error, faul
 
 
 def test_a_sensor_is_excluded_if_its_fault_is_still_likely_after_a_further_advance():
-    """A leap of the needle looks like a fault until the fit has followed it."""
+    """A leap of the needle resembles a fault until the fit has followed it."""
     scenario = flexneedle.load_scenario("phantom")
     step = scenario.setup.max_advance_mm
 

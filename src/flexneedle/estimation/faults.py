@@ -92,7 +92,7 @@ def find_faults(fitted: FittedInsertion) -> dict[str, Fault]:
 
 
 def _beside_others(rows: Mapping[str, _Rows]) -> dict[str, _Rows]:
-    """Return the rows of each sensor as far as another has measured since: alone it cannot be told from a leap."""
+    """Return the rows of each sensor as far as another has measured since: alone, a fault and a leap are alike."""
     newest = {name: one.move.max() for name, one in rows.items()}
     known = {}
     for name, one in rows.items():

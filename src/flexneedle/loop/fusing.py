@@ -39,7 +39,7 @@ class Watch:
     suspect: tuple[str, float] = (
         "",
         0.0,
-    )  # sensor whose fault is to be confirmed, and the depth (mm) where it was found
+    )  # sensor whose fault is not confirmed yet, and the depth (mm) where it was found
 
     def of(self, name: str) -> SensorMonitor:
         """Return the monitor of a sensor."""
