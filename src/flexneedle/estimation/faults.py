@@ -52,6 +52,10 @@ class _Rows(NamedTuple):
     across: int  # number of values of a lateral pair or of a single value
     shares: Floats  # weights (n, b) of the moves in the means
 
+    def take(self, kept: Flags) -> "_Rows":
+        """Return the rows `kept` (n,)."""
+        return _Rows._make(part[kept] if isinstance(part, np.ndarray) else part for part in self)
+
     @property
     def is_common(self) -> bool:
         """True if its values are one lateral pair, or one value."""
@@ -99,7 +103,7 @@ def _beside_others(rows: Mapping[str, _Rows]) -> dict[str, _Rows]:
         others = max((move for key, move in newest.items() if key != name), default=-np.inf)
         kept = one.move < others + 0.5 * _FEW + _ROUNDING
         if kept.any():
-            known[name] = _Rows(*(part[kept] if isinstance(part, np.ndarray) else part for part in one))
+            known[name] = one.take(kept)
     return known
 
 
