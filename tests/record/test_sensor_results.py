@@ -8,8 +8,16 @@ import pytest
 import flexneedle
 from flexneedle.record.fields import page_values
 from flexneedle.record.results import RESULT_KEYS, insertion_result
-from flexneedle.record.sensor_results import sensor_columns, sensor_results, sensor_row
-from flexneedle.types import OK, CheckedReading, Reading, Verdict, VerdictKind
+from flexneedle.record.sensor_results import sensor_columns, sensor_results, sensor_row, tracker_silent_mm
+from flexneedle.types import (
+    OK,
+    CheckedMeasurement,
+    CheckedReading,
+    Measurement,
+    Reading,
+    Verdict,
+    VerdictKind,
+)
 from synthetic import make_insertion
 from synthetic_sensors import EXCLUDED_FROM, FROZEN, with_sensors
 
@@ -72,12 +80,14 @@ def test_a_sensor_is_silent_from_its_last_good_reading_on(last):
     periods = []
     for k, one in enumerate(SENSED.periods):
         good = () if last is not None and k > last else (replace(GOOD, reading=Reading(one.time, ((1.0,),))),)
-        periods.append(replace(one, sensors=(replace(one.sensors[0], readings=(*good, MISSING)),)))
-    (found,) = sensor_results(replace(SENSED, scenario=scenario, periods=tuple(periods)))
-    if last is None:
-        assert math.isnan(found.silent_mm)
-    else:
-        assert found.silent_mm == SENSED.periods[last].estimate.x
+        tips = tuple(CheckedMeasurement(Measurement(each.reading.time, 1.0, 0.0), OK) for each in good)
+        sensors = (replace(one.sensors[0], readings=(*good, MISSING)),)
+        periods.append(replace(one, sensors=sensors, readings=tips))
+    insertion = replace(SENSED, scenario=scenario, periods=tuple(periods))
+    depth = math.nan if last is None else SENSED.periods[last].estimate.x
+    (found,) = sensor_results(insertion)
+    assert found.silent_mm == pytest.approx(depth, nan_ok=True)
+    assert tracker_silent_mm(insertion) == pytest.approx(depth, nan_ok=True)
 
 
 def test_a_result_has_sensors_only_with_sensors():

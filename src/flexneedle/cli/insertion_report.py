@@ -106,10 +106,13 @@ def _tip_sd(insertion: Insertion) -> list[tuple[str, str]]:
 
 
 def _sensors(insertion: Insertion) -> Iterator[tuple[str, str]]:
-    """Yield the row of each sensor along the needle, followed by its exclusion or loss."""
-    from flexneedle.record.sensor_results import sensor_results
+    """Yield the row of each sensor along the needle, followed by its exclusion or loss; before them a lost tracker."""
+    from flexneedle.record.sensor_results import sensor_results, tracker_silent_mm
 
-    for one in sensor_results(insertion):
+    found = sensor_results(insertion)
+    if found and not isnan(since := tracker_silent_mm(insertion)):
+        yield "tracker: no good reading", f"since {since:.1f} mm deep"
+    for one in found:
         yield f"sensor {one.name}", one.summary
         if one.excluded:
             yield f"  excluded {one.excluded_mm:.1f} mm deep", one.excluded

@@ -1,7 +1,7 @@
 """Results of the sensors along the needle over an insertion: readings, innovations, exclusion, and the tip's sd."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
@@ -122,12 +122,22 @@ def _silent_mm(scenario: Scenario | None, name: str, steps: list[tuple[Period, S
     sensor = next((one for one in scenario.sensor if one.title == name), None) if scenario else None
     if scenario is None or sensor is None:
         return math.nan
-    good = [
-        (period.estimate.x, one.reading.time)
-        for period, state in steps
-        for one in state.readings
-        if one.verdict.ok
-    ]
-    depth, heard = good[-1] if good else (steps[0][0].estimate.x, -math.inf)
+    good = [[one.reading.time for one in state.readings if one.verdict.ok] for _, state in steps]
     limit = scenario.control.stale_after_s + sensor.delay_s + 1.0 / sensor.rate_hz
-    return depth if steps[-1][0].time - heard > limit else math.nan
+    return _silent([period for period, _ in steps], good, limit)
+
+
+def tracker_silent_mm(insertion: Insertion) -> float:
+    """Return the depth of the tip (mm) since which the tracker has no good reading; NaN if the last is not stale."""
+    scenario = insertion.scenario
+    if scenario is None or not scenario.tracker.enabled or not insertion.periods:
+        return math.nan
+    good = [[one.measurement.time for one in each.readings if one.verdict.ok] for each in insertion.periods]
+    return _silent(insertion.periods, good, scenario.control.stale_after_s)
+
+
+def _silent(periods: Sequence[Period], good: Sequence[Sequence[float]], limit: float) -> float:
+    """Return the depth (mm) at the last good readings, with their times (s) by period; NaN if within `limit` (s)."""
+    heard = [(period.estimate.x, times[-1]) for period, times in zip(periods, good, strict=True) if times]
+    depth, last = heard[-1] if heard else (periods[0].estimate.x, -math.inf)
+    return depth if periods[-1].time - last > limit else math.nan
