@@ -248,7 +248,7 @@ class Fusing(AtRest):
 
 def test_only_a_sensor_that_corrects_the_estimate_measures_the_needle():
     scenario = SCENARIO.with_values({"sensor": [{"kind": "fbg", "sites_mm": [11.0]}]})
-    watch = Watch({"fbg": SensorMonitor(heard=1.0)})
+    watch = Watch({"fbg": SensorMonitor(heard=1.0, measured=True)})
     for estimate, sensed in ((Fusing(), True), (AtRest(), False)):
         observation = Observation(estimate, Monitor(scenario.monitor), watch=watch)
         assert observation.sensed_at(scenario, 1.1) is sensed

@@ -18,6 +18,8 @@ POINTS = {"kind": "points", "to_mm": 40.0}
 VIEW = {"kind": "view", "to_mm": 40.0}
 SIDE = [[8.0, 0.0, 0.0, 0.0], [0.0, 8.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 10.0]]  # the axis passes the camera
 ALONG = [[0.0, 0.0, 0.0, 5.0], [0.0, 8.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]  # the axis is a point
+FBG = {"kind": "fbg", "sites_mm": [11.0, 26.0]}
+ALONE = {"tracker.enabled": False, "control.start_axial_sd_mm": 0.0}
 REFUSED = [
     ({"tracker.enabled": False}, "tracker.enabled = false"),
     ({"sensor": [{"kind": "fbg", "sites_mm": [10.0, 149.0]}]}, "sensor[0].sites_mm = 149.0"),
@@ -55,7 +57,9 @@ def test_sensors_that_cannot_measure_are_refused_in_one_line(changes, key):
         ({"sensor": [SLICE | {"rate_hz": 0.07}]}, "sensor[0].rate_hz"),  # 68.5 mm at 5 mm/s: 13.7 s
         ({"sensor": [SLICE | {"delay_s": 13.8}]}, "sensor[0].delay_s"),
         ({"control.essential_points": True}, "control.essential_points"),
-        ({"tracker.enabled": False, "sensor": [SLICE]}, "control.start_axial_sd_mm"),
+        ({"tracker.enabled": False, "sensor": [FBG]}, "control.start_axial_sd_mm"),
+        (ALONE | {"sensor": [SLICE]}, "tracker.enabled"),
+        (ALONE | {"sensor": [POINTS | {"from_mm": -20.0}]}, "tracker.enabled"),  # the tip starts at -28.5 mm
     ],
 )
 def test_settings_without_effect_have_a_line(changes, key):
@@ -63,13 +67,17 @@ def test_settings_without_effect_have_a_line(changes, key):
     assert line.startswith(f"{key} = ")
 
 
+def test_points_that_begin_at_the_start_are_enough_without_a_tracker():
+    assert not find_doubts(PHANTOM.with_values(ALONE | {"sensor": [POINTS | {"from_mm": -40.0}]}))
+
+
 def test_a_sensor_in_time_for_one_reading_raises_no_doubt():
     assert not find_doubts(PHANTOM.with_values({"sensor": [SLICE | {"rate_hz": 0.08, "delay_s": 13.6}]}))
 
 
 def test_a_fibre_alone_needs_sites_no_farther_apart_than_the_needle_bends():
-    alone = {"tracker.enabled": False, "control.start_axial_sd_mm": 0.0, "target.depth_mm": 70.0}
-    thin = alone | {"needle": {"outer_diameter_mm": 0.5, "youngs_modulus_gpa": 60.0, "length_mm": 150.0}}
+    thin = ALONE | {"target.depth_mm": 70.0}
+    thin |= {"needle": {"outer_diameter_mm": 0.5, "youngs_modulus_gpa": 60.0, "length_mm": 150.0}}
     few = {"sensor": [{"kind": "fbg", "sites_mm": [10.0, 60.0]}]}
     (line,) = find_doubts(PHANTOM.with_values(thin | few))
     assert line.startswith("sensor[0].sites_mm: 50 mm of the inserted needle without a site")

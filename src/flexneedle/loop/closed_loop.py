@@ -118,7 +118,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         if motion.held:
             decided, step = decided.hold_back(motion.held, state), step.hold_back(motion.held)
         state = _advance(decided, step, observation, steering, begun, now)
-        ending = _ending(task, state)
+        ending = _ending(task, state, now)
         period = _make_period(index, now, task, rig, step, motion.control, observation, clocks)
         warning = warn_of_miss(step.decision, state.in_a_row) or step.decision.doubt
         warning = warning or _warn_of_zone(steering.guard.zones, observation.estimate.state)
@@ -184,13 +184,13 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
     return motion
 
 
-def _ending(task: Task, state: LoopState) -> _Ending | None:
-    """Return outcome and reason if the insertion ends with this period."""
+def _ending(task: Task, state: LoopState, now: float) -> _Ending | None:
+    """Return outcome and reason if the insertion ends with this period, at a time (s)."""
     estimate = state.observation.estimate
     if not estimate.state.converged:
         return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
     if not state.measured_at_rest:
-        return _hold_ending(task.scenario, state)
+        return _hold_ending(task.scenario, state) or _blind_ending(task.scenario, state, now)
     short = task.plan.target[0] - float(estimate.tip[X])
     if short > task.scenario.control.depth_tolerance_mm and is_at_depth(task, None, estimate):
         return Outcome.DONE, f"stroke ends {format_mm(short)} before the target depth"
@@ -207,6 +207,15 @@ def _hold_ending(scenario: Scenario, state: LoopState) -> _Ending | None:
         why = state.asked or refused.reason if held is None else observation.verdict
         return Outcome.HELD, f"held for {state.held_in_all:.2f} s in all (limit {total:.2f} s): {why}"
     return refused.ending(scenario.control.hold_limit_s)
+
+
+def _blind_ending(scenario: Scenario, state: LoopState, now: float) -> _Ending | None:
+    """Return outcome and reason if no sensor measures the needle at rest, since all images are elsewhere."""
+    rested = 0.0 if state.arrived_at is None else now - state.arrived_at
+    limit = scenario.control.hold_limit_s + scenario.longest_wait
+    if not scenario.sensor or state.hold is not None or rested <= limit:
+        return None
+    return Outcome.HELD, f"not measured at rest for {rested:.2f} s (limit {limit:.2f} s)"
 
 
 def _make_period(

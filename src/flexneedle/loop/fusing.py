@@ -27,6 +27,7 @@ _IN_DOUBT = 15.0  # of a fault of the tracker, from which the needle is held: a 
 _LARGE = 0.25  # over the miss limit: with an error as large it is held from `_LIKELY` on
 _LIKELY = 1.0
 _CLEAR = 3.0  # by which a fault must be likelier than another
+_NONE = "", -math.inf
 _MOVES = 2  # after which faults are searched again: the newest readings are averaged over two
 
 
@@ -36,10 +37,8 @@ class Watch:
 
     monitors: Mapping[str, SensorMonitor] = field(default_factory=dict)
     judged: int = 0  # number of moves when nothing was in doubt
-    suspect: tuple[str, float] = (
-        "",
-        0.0,
-    )  # sensor whose fault is not confirmed yet, and the depth (mm) where it was found
+    # depths (mm) at which sensors' faults were found that are not confirmed yet
+    suspects: Mapping[str, float] = field(default_factory=dict)
 
     def of(self, name: str) -> SensorMonitor:
         """Return the monitor of a sensor."""
@@ -93,15 +92,13 @@ def _read_sensor(
     monitor, checked = check_readings(monitor, readings, compared, now, max_age)
     good = np.array([one.verdict.ok for one in checked])
     nis = compared.nis(good) if good.any() else math.nan
-    monitor = monitor.hear(one.reading.time for one in checked if one.verdict.ok)
-    if not _is_seen(
-        sensor, scenario, predicted
-    ):  # an image without the needle is no loss before it comes there
-        monitor = monitor.hear(
-            one.reading.time
-            for one in checked
-            if one.verdict.kind is VerdictKind.MISSING and one.reading.status == VISIBLE
-        )
+    empty = [one.reading for one in checked if one.verdict.kind is VerdictKind.MISSING]
+    if _is_seen(sensor, scenario, predicted):  # an image without the needle is no loss before it comes there
+        empty = []
+    monitor = monitor.hear(
+        [one.reading.time for one in checked if one.verdict.ok],
+        [one.time for one in empty if one.status == VISIBLE],
+    )
     if monitor.excluded.ok:
         frozen = monitor.check_frozen(depth, scenario.monitor.frozen_travel_mm, sensor.resolution)
         monitor = replace(monitor, excluded=frozen)
@@ -131,43 +128,49 @@ def exclude_faulty(
     if len(estimate.moves) - watch.judged < _MOVES:
         return estimate, watch, tuple(states), OK
     faults = {name: one for name, one in estimate.faults().items() if watch.of(name).excluded.ok}
+    likely = [name for name, one in faults.items() if name != TRACKER and one.log_odds > _FAULTY]
+    watch = replace(watch, suspects={name: watch.suspects.get(name, depth) for name in likely})
     miss_limit = estimate.nominal.scenario.control.miss_limit_mm
-    faulty, verdict = judge_faults(faults, miss_limit if estimate.tracked else None)
-    if faulty in ("", TRACKER):
-        judged = len(estimate.moves) if verdict.ok else watch.judged
-        return estimate, replace(watch, judged=judged, suspect=NO_WATCH.suspect), tuple(states), verdict
-    name, found = watch.suspect
-    if name != faulty:
-        return estimate, replace(watch, suspect=(faulty, depth)), tuple(states), OK
-    if depth < found + estimate.nominal.scenario.setup.max_advance_mm:  # the fit may still follow a leap
-        return estimate, watch, tuple(states), OK
-    watch = watch.change(faulty, replace(watch.of(faulty), excluded=verdict))
-    after = tuple(replace(one, verdict=verdict) if one.name == faulty else one for one in states)
-    return estimate.without(faulty, _time_of_depth(estimate, faults[faulty].since)), watch, after, OK
+    found, verdict = judge_faults(faults, miss_limit if estimate.tracked else None)
+    if verdict.ok:
+        return estimate, replace(watch, judged=len(estimate.moves)), tuple(states), OK
+    if TRACKER in found:
+        return estimate, watch, tuple(states), verdict
+    if depth < watch.suspects[found[0]] + estimate.nominal.scenario.setup.max_advance_mm:
+        return estimate, watch, tuple(states), OK  # the fit may still follow a leap
+    if len(found) > 1:
+        return estimate, watch, tuple(states), verdict
+    (name,) = found
+    watch = watch.change(name, replace(watch.of(name), excluded=verdict))
+    after = tuple(replace(one, verdict=verdict) if one.name == name else one for one in states)
+    return estimate.without(name, _time_of_depth(estimate, faults[name].since)), watch, after, OK
 
 
-def judge_faults(faults: Mapping[str, Fault], miss_limit: float | None) -> tuple[str, Verdict]:
-    """Return the sensor that is wrong, "" for none or if it is not clear which, and a verdict.
+def judge_faults(faults: Mapping[str, Fault], miss_limit: float | None) -> tuple[tuple[str, ...], Verdict]:
+    """Return the sensor that is wrong, none, or two of which it is not clear which one is wrong, and a verdict.
 
     faults: the likeliest of each sensor by name; miss_limit (mm): None if the tracker is lost.
     """
     odds = {name: one.log_odds for name, one in faults.items()}
-    tip, most = odds.pop(TRACKER, -math.inf), max(odds.values(), default=-math.inf)
-    name = max(odds, key=lambda name: odds[name], default="")
+    tip, error = odds.pop(TRACKER, -math.inf), faults[TRACKER].error if TRACKER in faults else 0.0
+    (name, most), (other, second) = (*sorted(odds.items(), key=lambda one: -one[1]), _NONE, _NONE)[:2]
     if most > _FAULTY and most - tip > _CLEAR:
-        reason = f"by the other sensors and the model (log odds of an error {most:.1f}, limit {_FAULTY:.1f})"
-        return name, Verdict(VerdictKind.CONTRADICTED, reason)
-    error = faults[TRACKER].error if TRACKER in faults else 0.0
+        seen = f"log odds of an error {most:.1f}"
+        if most - second > _CLEAR:
+            reason = f"by the other sensors and the model ({seen}, limit {_FAULTY:.1f})"
+            return (name,), Verdict(VerdictKind.CONTRADICTED, reason)
+        reason = f"{name} or {other}, not clear which ({seen} and {second:.1f}, limit {_FAULTY:.1f})"
+        return (name, other), Verdict(VerdictKind.CONTRADICTED, reason)
     is_large = miss_limit is not None and error > _LARGE * miss_limit
     limit = _LIKELY if is_large else _IN_DOUBT
     if tip > limit and most - tip < _CLEAR:
         seen, against = f"log odds of an error of {error:.1f} mm {tip:.1f}", f"limit {limit:.1f}"
         if tip - most > _CLEAR:
             reason = f"{TRACKER}, by the other sensors ({seen}, {against})"
-            return TRACKER, Verdict(VerdictKind.CONTRADICTED, reason)
+            return (TRACKER,), Verdict(VerdictKind.CONTRADICTED, reason)
         reason = f"{TRACKER} or {name}, not clear which ({seen} and {most:.1f}, {against})"
-        return "", Verdict(VerdictKind.CONTRADICTED, reason)
-    return "", OK
+        return (TRACKER, name), Verdict(VerdictKind.CONTRADICTED, reason)
+    return (), OK
 
 
 def _time_of_depth(estimate: Any, depth: float) -> float:
@@ -199,12 +202,17 @@ def check_silent(scenario: Scenario, watch: Watch, now: float) -> Verdict:
 
 
 def is_sensed(scenario: Scenario, watch: Watch, now: float) -> bool:
-    """Return if a sensor along the needle, not excluded, has a good reading that is not stale; now (s)."""
+    """Return if a sensor along the needle, not excluded, has a reading that is good and not stale; now (s).
+
+    A reading without the needle is good where none is, but not before the first of any sensor with the needle.
+    """
     return _silence(scenario, watch, now) <= scenario.control.stale_after_s
 
 
 def _silence(scenario: Scenario, watch: Watch, now: float) -> float:
-    """Return the time (s) since the last good reading of any sensor along the needle, less its delay and period."""
+    """Return the time (s) since the last reading as for `is_sensed`, less the sensor's delay and period."""
+    if not any(one.measured for one in watch.monitors.values()):
+        return math.inf
     good = (one for one in scenario.sensor if watch.of(one.title).excluded.ok)
     ages = (now - watch.of(one.title).heard - one.delay_s - 1.0 / one.rate_hz for one in good)
     return min(ages, default=math.inf)

@@ -110,7 +110,7 @@ def observe_all(
         found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, used)
         return replace(found, watch=watch, sensors=sensors)
     found = observe(scenario, predicted, before.monitor, begun, now, rig.tracker, sensors)
-    heard = (one.measurement.time for one in found.readings if one.verdict.ok)
+    heard = [one.measurement.time for one in found.readings if one.verdict.ok]
     watch = watch.change(TRACKER, watch.of(TRACKER).hear(heard))
     estimate, watch, sensors, verdict = exclude_faulty(found.estimate, watch, sensors, before.watch)
     if verdict.ok:

@@ -65,6 +65,8 @@ class Steering:
             return Step(Action.HOLD, held, reading), replace(state, late=None)
         if state.arrived_at is not None:
             delay = begun - state.observation.newest
+            if self.task.scenario.sensor:
+                delay = min(delay, self.task.scenario.longest_wait)
             waiting = Decision(STILL, "waiting for the last reading", predicted=state.predicted)
             return Step(Action.REST, waiting, max(reading, delay)), state
         asked = self.stream.gate.hold()

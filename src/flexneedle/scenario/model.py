@@ -182,6 +182,12 @@ class Scenario(Section):
             tops.append(tops[-1] + (layer.thickness_mm or 0.0))
         return tuple(tops)
 
+    @property
+    def longest_wait(self) -> float:
+        """Time (s) within which the slowest sensor along the needle sends a reading; later none is awaited."""
+        slowest = max((one.delay_s + 1.0 / one.rate_hz for one in self.sensor), default=0.0)
+        return self.control.stale_after_s + slowest
+
     def energy_scale(self, depth: float) -> float:
         """Return E₁, the energy (mJ) of all tissue down to `depth` (mm) displaced by 1 mm, weighted by layer."""
         ends = (*self.layer_tops[1:], max(depth, self.layer_tops[-1]))

@@ -5,6 +5,8 @@ from itertools import pairwise
 from statistics import fmean
 from typing import NamedTuple
 
+import numpy as np
+
 from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
@@ -15,6 +17,7 @@ from flexneedle.scenario.sensors.points import Points
 from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.scenario.zone_files import find_lost
+from flexneedle.types import Needles, X
 
 
 class Range(NamedTuple):
@@ -169,6 +172,17 @@ def _find_idle_sensors(scenario: Scenario) -> Iterator[str]:
     if not scenario.tracker.enabled and control.start_axial_sd_mm:
         rule = "without a tracker this error of the depth remains: home the tip, and set it to what is left"
         yield f"control.start_axial_sd_mm = {control.start_axial_sd_mm:g}: {rule}"
+    if not scenario.tracker.enabled and not any(_sees_start(one, scenario) for one in scenario.sensor):
+        rule = "no sensor measures the needle at its start, where it is held: add one, such as an fbg"
+        yield f"tracker.enabled = false: {rule}"
+
+
+def _sees_start(sensor: Sensor, scenario: Scenario) -> bool:
+    """Return if a sensor measures the needle before it moves."""
+    along = np.linspace(-scenario.needle.length_mm, 0.0, 21)
+    poses = np.zeros((1, along.size, 5))
+    poses[0, :, X] = scenario.setup.start_tip_x + along
+    return bool(sensor.sees(Needles(poses, along[1] - along[0]), scenario.setup.axes).any())
 
 
 def _find_late(at: str, sensor: Sensor, scenario: Scenario) -> Iterator[str]:

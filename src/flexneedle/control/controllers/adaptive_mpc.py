@@ -188,7 +188,8 @@ def _rest_time(task: Task, memory: Memory, fitted: Identified, left: float) -> t
     """
     setup = task.scenario.setup
     step = setup.max_advance_mm
-    catching_up = fitted.lag + step / setup.insertion_speed_mm_s
+    lag = min(fitted.lag, task.scenario.longest_wait) if fitted.along else fitted.lag
+    catching_up = lag + step / setup.insertion_speed_mm_s
     rests = max(memory.rests, sum(left <= distance * step + 1e-9 for distance in _RESTS))
     if rests > memory.rests or _is_surprised(fitted):
         # None where the needle was measured at rest for as long already, since the decision came late.

@@ -6,7 +6,7 @@ one after another are no chance, and are used: a sensor that contradicts the oth
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,8 @@ class SensorMonitor:
 
     newest: the newest reading; repeats: readings with its rows; since: depth (mm) of the tip at the first of them;
     outliers: number of the last readings, one after another, far from their predictions; excluded: why the sensor does
-    not count any more; heard: time (s) of the last reading that is good, or that has no needle where none is.
+    not count any more; heard: time (s) of the last reading that is good, or that has no needle where none is; measured:
+    true after the first good one.
     """
 
     newest: Reading | None = None
@@ -34,10 +35,12 @@ class SensorMonitor:
     outliers: int = 0
     excluded: Verdict = OK
     heard: float = -math.inf
+    measured: bool = False
 
-    def hear(self, times: Iterable[float]) -> "SensorMonitor":
-        """Return the state with the times (s) of readings."""
-        return replace(self, heard=max([self.heard, *times]))
+    def hear(self, good: Sequence[float], empty: Sequence[float] = ()) -> "SensorMonitor":
+        """Return the state with the times (s) of good readings, and of those that have no needle where none is."""
+        heard, measured = max([self.heard, *good, *empty]), self.measured or bool(good)
+        return replace(self, heard=heard, measured=measured)
 
     def add(self, readings: Sequence[Reading], depth: float) -> "SensorMonitor":
         """Return the state with readings, with the tip at a depth (mm)."""
