@@ -148,9 +148,8 @@ def test_a_slow_sensor_measures_between_its_readings():
     watch = Watch({"slice 1": SensorMonitor(heard=10.0, measured=True)})
     assert is_sensed(scenario, watch, 10.8)
     assert not is_sensed(scenario, watch, 11.0)
-    assert not is_sensed(
-        scenario, Watch({"slice 1": SensorMonitor(heard=10.0, excluded=Verdict(VerdictKind.FROZEN))}), 10.1
-    )
+    excluded = SensorMonitor(heard=10.0, measured=True, excluded=Verdict(VerdictKind.FROZEN))
+    assert not is_sensed(scenario, Watch({"slice 1": excluded}), 10.1)
 
 
 def test_images_that_the_needle_has_not_come_to_yet_are_no_loss():

@@ -9,6 +9,7 @@ from typing import Any
 from flexneedle.results import Insertion, Period, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sensors.points import Points
+from flexneedle.scenario.sensors.sensor import Sensor
 from flexneedle.scenario.sensors.slice import Slice
 from flexneedle.types import Point, SensorState, VerdictKind
 
@@ -118,12 +119,17 @@ def _excluded_mm(steps: list[tuple[Period, SensorState]]) -> float:
 
 
 def _silent_mm(scenario: Scenario | None, name: str, steps: list[tuple[Period, SensorState]]) -> float:
-    """Return the depth of the tip (mm) since which a sensor has no good reading; NaN if its last one is not stale."""
+    """Return the depth of the tip (mm) since which a sensor has no good reading; NaN if its last one is not stale.
+
+    Images in which the needle was never seen are not silent.
+    """
     sensor = next((one for one in scenario.sensor if one.title == name), None) if scenario else None
     if scenario is None or sensor is None:
         return math.nan
     good = [[one.reading.time for one in state.readings if one.verdict.ok] for _, state in steps]
     limit = scenario.control.stale_after_s + sensor.delay_s + 1.0 / sensor.rate_hz
+    if type(sensor).sees is not Sensor.sees and not any(good):
+        return math.nan
     return _silent([period for period, _ in steps], good, limit)
 
 

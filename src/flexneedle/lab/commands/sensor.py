@@ -70,8 +70,7 @@ def _check(args: argparse.Namespace) -> int:
     from flexneedle.loop.virtual import VirtualRig
     from flexneedle.scenario.files import load_scenario
 
-    scenario, rig = load_scenario(args.scenario), None
-    names = choose_sensors(scenario, args.sensor)
+    scenario, rig = choose_sensors(load_scenario(args.scenario), args.sensor), None
     if args.rig is None:
         run = run_on(VirtualRig(), scenario, args.seed, Stream())
     else:
@@ -79,7 +78,7 @@ def _check(args: argparse.Namespace) -> int:
 
         source = SupervisedRig(args.rig)
         rig, run = source.file, _run_on_rig(args, source, scenario)
-    fit = fit_in_air(scenario, run, names)
+    fit = fit_in_air(scenario, run)
     errors = find_errors(fit, rig)
     lines, failed = lines_to_paste(errors), any(one.line for one in errors)
     values = {

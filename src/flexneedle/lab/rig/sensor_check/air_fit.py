@@ -6,7 +6,7 @@ standard deviation stays near its prior is not found. Times are relative to the 
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,8 +68,8 @@ class AirModel:
     tip: Floats  # measured x, y, z (r, 1 + a), mm
 
     @staticmethod
-    def of(scenario: Scenario, run: AirRun, names: Collection[str]) -> "AirModel":
-        """Return the model of a run, with the sensors of these names."""
+    def of(scenario: Scenario, run: AirRun) -> "AirModel":
+        """Return the model of a run."""
         simulator, axes, slots = Simulator(scenario), scenario.setup.axes, NeedleSlots(scenario.setup.axes)
         control, priors = scenario.control, Priors()
         guided, tracked = scenario.setup.has_guide, bool(run.measurements)
@@ -82,7 +82,7 @@ class AirModel:
             *(*[_BIAS_MM] * (1 + axes), _LAG_SD * tracked),
         ]
         sensors = []
-        for sensor in (one for one in scenario.sensor if one.title in names):
+        for sensor in scenario.sensor:
             found, more = SensorFit.begin(sensor, axes, len(sds), wide_priors(sensor), np.zeros(0))
             sensors.append(found)
             sds += more
@@ -202,12 +202,9 @@ class AirFit:
         return model.predict(parameters, tips[0], model.quantities(shapes[0]))[1]
 
 
-def fit_in_air(scenario: Scenario, run: AirRun, names: Collection[str] | None = None) -> AirFit:
-    """Return the fit of a run: first with the scenario's noise, then with the noise as seen and without outliers.
-
-    names: sensors that are checked (default: all).
-    """
-    model = AirModel.of(scenario, run, [one.title for one in scenario.sensor] if names is None else names)
+def fit_in_air(scenario: Scenario, run: AirRun) -> AirFit:
+    """Return the fit of a run: first with the scenario's noise, then with the noise as seen and without outliers."""
+    model = AirModel.of(scenario, run)
     ends = model.quantities(model.simulate([model.mean])[1][0])
     starts = [_find_start(model, one, each) for one, each in zip(model.sensors, ends, strict=True)]
     start = model.mean.copy()

@@ -14,14 +14,15 @@ from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 
 
-def choose_sensors(scenario: Scenario, name: str | None) -> list[str]:
-    """Return the names of the sensors to check, all for None. Raises InputError if there is none of this name."""
+def choose_sensors(scenario: Scenario, name: str | None) -> Scenario:
+    """Return the scenario with the sensors to check, all for None. Raises InputError if there is none of this name."""
     names = [one.title for one in scenario.sensor]
     if not names:
         raise InputError("the scenario has no [[sensor]]: nothing to check")
     if name is not None and name not in names:
         raise InputError(f"--sensor {name}: must be one of {', '.join(names)}")
-    return names if name is None else [name]
+    chosen = tuple(one for one in scenario.sensor if name in (None, one.title))
+    return scenario.model_copy(update={"sensor": chosen})
 
 
 def run_on(source: RigSource, scenario: Scenario, seed: int, stream: Stream) -> AirRun:
