@@ -90,6 +90,17 @@ def test_a_sensor_is_silent_from_its_last_good_reading_on(last):
     assert tracker_silent_mm(insertion) == pytest.approx(depth, nan_ok=True)
 
 
+def test_an_image_in_which_the_needle_never_was_is_not_silent():
+    scenario = flexneedle.load_scenario("phantom").with_values(
+        {"sensor": [{"kind": "slice", "name": "fbg", "plane_mm": 39.0}]}
+    )
+    periods = [
+        replace(one, sensors=(replace(one.sensors[0], readings=(MISSING,)),)) for one in SENSED.periods
+    ]
+    (found,) = sensor_results(replace(SENSED, scenario=scenario, periods=tuple(periods)))
+    assert math.isnan(found.silent_mm)
+
+
 def test_a_result_has_sensors_only_with_sensors():
     assert set(insertion_result(make_insertion())) == set(RESULT_KEYS)
     found = insertion_result(SENSED)
