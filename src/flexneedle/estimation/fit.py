@@ -39,23 +39,9 @@ def improve_fit(fitted: Fitted) -> Fitted:
 
     The step is shortened until the cost does not rise.
     """
-    prior = fitted.prior
-    jacobian, variance = jacobian_of(fitted), variance_of_rows(fitted)
-    left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
-    whitening = Whitening.of(fitted, variance) if fitted.has_field else None
-    if whitening:
-        jacobian, left, variance = (
-            whitening.of_rows(jacobian),
-            whitening.of_rows(left),
-            np.ones_like(variance),
-        )
-    weighted = jacobian.conj().T / variance
-    gradient = (weighted @ left).real - prior.precision @ off
-    precision = (weighted @ jacobian).real + prior.precision
-    if fitted.along:
-        gradient, precision = inform_along(fitted, gradient, precision)
+    gradient, precision, variance, whitening = inform(fitted)
     fitted = fitted.change(precision=precision)
-    goal = fitted.parameters + step_within(precision, gradient, prior.bounds - fitted.parameters)
+    goal = fitted.parameters + step_within(precision, gradient, fitted.prior.bounds - fitted.parameters)
 
     def cost(other: FittedInsertion) -> float:
         return cost_of(other, variance, whitening)
@@ -74,6 +60,25 @@ def improve_fit(fitted: Fitted) -> Fitted:
         if not is_worse(trial):
             break
     return differentiate(trial)
+
+
+def inform(fitted: FittedInsertion) -> "tuple[Floats, Floats, Floats, Whitening | None]":
+    """Return the downhill gradient (K,), the precision (K, K), and variances (r,) and whitening of the tip's rows."""
+    prior, jacobian, variance = fitted.prior, jacobian_of(fitted), variance_of_rows(fitted)
+    left, off = np.concatenate(fitted.residuals), fitted.parameters - prior.mean
+    whitening = Whitening.of(fitted, variance) if fitted.has_field else None
+    if whitening:
+        jacobian, left, variance = (
+            whitening.of_rows(jacobian),
+            whitening.of_rows(left),
+            np.ones_like(variance),
+        )
+    weighted = jacobian.conj().T / variance
+    gradient = (weighted @ left).real - prior.precision @ off
+    precision = (weighted @ jacobian).real + prior.precision
+    if fitted.along:
+        gradient, precision = inform_along(fitted, gradient, precision)
+    return gradient, precision, variance, whitening
 
 
 def variance_of_rows(fitted: FittedInsertion) -> Floats:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from flexneedle.estimation.axial import axial_variance
-from flexneedle.estimation.fit import lasting_covariance
+from flexneedle.estimation.fit import inform, lasting_covariance
 from flexneedle.estimation.fitted import LASTING, FittedInsertion
 from flexneedle.estimation.lateral import directions, variance_of
 from flexneedle.estimation.prior import LEAST_SD
@@ -39,6 +39,17 @@ class KnownInsertion(FittedInsertion):
         field = (self.axes + 1) * self.field_sd**2
         return float(np.sqrt(variance_of(slope, self.covariance) + axial + field))
 
+    @cached_property
+    def present_covariance(self) -> Floats:
+        """Posterior covariance (K, K) of the parameters, with sensors along the needle by the derivatives as of now.
+
+        The derivatives of the fit are older by a step, and do not go with the present ones of the tip.
+        """
+        if not (self.along and self.moves):
+            return self.covariance
+        found: Floats = np.linalg.inv(inform(self)[1]).astype(np.float64)
+        return found
+
     @property
     def _tip_slope(self) -> Laterals:
         """Derivatives (K,) of the tip's lateral position to the parameters."""
@@ -57,7 +68,7 @@ class KnownInsertion(FittedInsertion):
         parts = np.stack([slope.real, slope.imag])
         covariance = np.zeros((3, 3))
         covariance[0, 0] = axial_variance(self.axial_covariance, self._axial_slope(0.0))
-        covariance[1:, 1:] = parts @ self.covariance @ parts.T + self._lasting
+        covariance[1:, 1:] = parts @ self.present_covariance @ parts.T + self._lasting
         return covariance
 
     @cached_property
@@ -66,7 +77,7 @@ class KnownInsertion(FittedInsertion):
         slope = self._tip_slope
         model = self.sensors[0].unexplained(self.nominal.scenario, self.settings)
         left = model**2 * (1.0 - math.exp(-2.0 * self._age_of_residual / LASTING))
-        gains = np.stack([slope.real, slope.imag]) @ self.covariance
+        gains = np.stack([slope.real, slope.imag]) @ self.present_covariance
         # Errors that cancel, since the needle was turned, are not subtracted: this is to first order only.
         sizes, ways = np.linalg.eigh(lasting_covariance(self, gains))
         lasting: Floats = (ways * np.maximum(sizes, 0.0)) @ ways.T + left * np.diag([1.0, self.axes - 1.0])
