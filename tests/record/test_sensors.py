@@ -94,3 +94,4 @@ def test_the_table_of_readings_has_one_line_per_reading():
     bent, missed = rows[:2]
     assert (bent["sensor"], bent["verdict"], bent["rows"]) == ("fbg", "ok", f"0.001 -0.0; nan {1 / 3e3!r}")
     assert (missed["status"], missed["verdict"], missed["rows"]) == ("no needle", "missing: no needle", "")
+    assert rows[2 * EXCLUDED_FROM]["verdict"] == "excluded"

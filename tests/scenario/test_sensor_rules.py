@@ -117,6 +117,7 @@ WRONG = [
     ({"base": Sensor}, "noise, predict"),
     ({"base": object}, "flexneedle.Sensor"),
     ({"predict": lambda _, n, __: n.at(0.0)[:, Y]}, "predict must return an array"),
+    ({"predict": lambda _, n, __: n.poses[:, :3, Y].T, "size": lambda *_: 3}, "predict must return an array"),
     ({"predict": lambda _, n, __: np.full((len(n.poses), 1), np.nan)}, "finite"),
     ({"predict": raising}, "ZeroDivisionError: no needle"),
     ({"noise": property(lambda _: 0.0)}, "noise must"),
@@ -125,7 +126,7 @@ WRONG = [
     ({"model_error": lambda *_: np.array([-1.0])}, "model_error must"),
     (
         {"sees": lambda _, n, __: np.ones(len(n.poses), dtype=bool)},
-        "`sees` must return flags of the shape (3, 1)",
+        "`sees` must return flags of the shape (21, 1)",
     ),
     ({"sees": lambda _, n, __: np.full((len(n.poses), 1), 0.5)}, "not float64"),
     ({"predict": lambda _, n, __: np.negative(n.poses, out=n.poses)[:, -1, [Y]]}, "must not be changed"),

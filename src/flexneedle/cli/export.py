@@ -37,8 +37,9 @@ square of the innovation, 1 on average) and NAME.verdict.
 --sensors: one row per reading of the sensors along the needle.
   time_s, period, sensor          time of measurement, control period of
                                   arrival, name of the sensor
-  verdict, status                 ok, or the reason for the rejection; ok, or
-                                  why the sensor has no value
+  verdict, status                 ok, excluded with its sensor, or the reason
+                                  for the rejection; ok, or why the sensor has
+                                  no value
   rows                            what it measured, rows of numbers as
                                   flexneedle.devices.Reading
   unit                            unit of rows: 1/mm, mm, px; empty for a kind

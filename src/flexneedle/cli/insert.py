@@ -245,6 +245,7 @@ class _InsertProgress:
         self._start = scenario.setup.start_tip_x
         self._travel = scenario.target.depth_mm - self._start
         self._warned = False
+        self._excluded = set[str]()
         progress.begin("Planning")
 
     def __call__(self, event: Event) -> None:
@@ -265,5 +266,10 @@ class _InsertProgress:
         if period.warning and not self._warned:
             self._warned = True
             self._progress.print_line(f"flexneedle: warning at {depth:.1f} mm: {period.warning}")
+        for state in period.sensors:
+            if not state.verdict.ok and state.name not in self._excluded:
+                self._excluded.add(state.name)
+                line = f"sensor {state.name} excluded at {depth:.1f} mm: {state.verdict}"
+                self._progress.print_line(f"flexneedle: {line}")
         done = min(max(depth - self._start, 0.0), self._travel)
         self._progress.show("Inserting", done, self._travel, f"tip at {depth:.1f} mm")

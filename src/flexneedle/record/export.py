@@ -118,7 +118,8 @@ def _unit(sensor: Sensor) -> str:
 
 def _reading_rows(period: int, state: SensorState) -> Iterator[dict[str, Any]]:
     for one in state.readings:
-        where = {"period": period, "sensor": state.name, "verdict": str(one.verdict)}
+        verdict = "excluded" if one.verdict.ok and not state.verdict.ok else str(one.verdict)
+        where = {"period": period, "sensor": state.name, "verdict": verdict}
         yield where | reading_values(one.reading)
 
 

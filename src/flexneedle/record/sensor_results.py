@@ -36,8 +36,8 @@ class SensorResult:
 
     @property
     def summary(self) -> str:
-        """Number of values, share of them that was rejected, and innovation."""
-        values = f"{self.readings - self.missing} values, {100.0 * self.rejected:.2g} % rejected"
+        """Number of readings with a value, share of them that was rejected, and innovation."""
+        values = f"{self.readings - self.missing} readings, {100.0 * self.rejected:.2g} % rejected"
         return values if math.isnan(self.mean_nis) else f"{values}, mean NIS {self.mean_nis:.2f}"
 
 

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed, print_json
-from flexneedle.cli.progress import print_line
+from flexneedle.cli.progress import Progress, print_line
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 from flexneedle.lab.commands.rig_parts import add_yes, print_findings
 from flexneedle.loop.events import AllGates, Gate, Stream
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from flexneedle.lab.rig.sensor_check.air_fit import AirFit
@@ -72,7 +73,8 @@ def _check(args: argparse.Namespace) -> int:
 
     scenario, rig = choose_sensors(load_scenario(args.scenario), args.sensor), None
     if args.rig is None:
-        run = run_on(VirtualRig(), scenario, args.seed, Stream())
+        with Progress() as progress:
+            run = run_on(VirtualRig(), scenario, args.seed, Stream(), _shown(progress))
     else:
         from flexneedle.lab.rig.supervised import SupervisedRig
 
@@ -108,15 +110,21 @@ def _run_on_rig(args: argparse.Namespace, source: SupervisedRig, scenario: Scena
         interrupt_on_signals(stack)
         ros = source.file.ros
         bridges = () if ros is None else (stack.enter_context(Bridge(ros, print_line)),)
-        gate = AllGates(*bridges, _UserGate(scenario, yes=args.yes))
-        return run_on(source, scenario, args.seed, Stream(bridges, gate))
+        progress = stack.enter_context(Progress())
+        gate = AllGates(*bridges, _UserGate(scenario, progress, yes=args.yes))
+        return run_on(source, scenario, args.seed, Stream(bridges, gate), _shown(progress))
+
+
+def _shown(progress: Progress) -> Callable[[int, int], None]:
+    """Return a function that shows the motions done, of all."""
+    return lambda done, count: progress.show("Moving in air", done, count, f"{done} of {count} motions")
 
 
 class _UserGate(Gate):
     """Prints the motions, and asks before motors move."""
 
-    def __init__(self, scenario: Scenario, *, yes: bool) -> None:
-        self._scenario, self._yes = scenario, yes
+    def __init__(self, scenario: Scenario, progress: Progress, *, yes: bool) -> None:
+        self._scenario, self._progress, self._yes = scenario, progress, yes
 
     def confirm(self, rig: Any) -> None:
         """Ask. Raises RunError for any answer but yes."""
@@ -129,7 +137,8 @@ class _UserGate(Gate):
             *describe_axes(rig.rig, rig.positions),
             ARMS,
         ]
-        confirm_motions(lines, "" if self._yes else "Move?")
+        with self._progress.pause_display():
+            confirm_motions(lines, "" if self._yes else "Move?")
 
 
 def _write(folder: Path, values: dict[str, Any], fit: AirFit) -> None:

@@ -12,6 +12,7 @@ from flexneedle.types import PSI, THETA, Needles, X, Y, Z
 
 _NODES = 21  # of the needles with which a user's kind is checked
 _BENT_PER_MM = 1e-3
+_REPEATS = 7  # of the three needles: a transposed array of few values has another shape
 
 KINDS = find_kinds(__name__, Sensor, "kind")
 
@@ -75,5 +76,6 @@ def _sample_needles(axes: int, length: float, depth: float) -> Needles:
     poses[..., X] = along - length + np.array([0.0, 0.0, depth])[:, None]
     for place, slope in ((Y, THETA), (Z, PSI))[:axes]:
         poses[1:, :, place], poses[1:, :, slope] = 0.5 * _BENT_PER_MM * along**2, _BENT_PER_MM * along
+    poses = np.tile(poses, (_REPEATS, 1, 1))
     poses.setflags(write=False)
     return Needles(poses, along[1])

@@ -1,7 +1,7 @@
 """Run of the motions in air on the ports of a rig."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -27,8 +27,15 @@ class AirRun:
     readings: dict[str, tuple[Reading, ...]]
 
 
-def run_in_air(scenario: Scenario, rig: Rig, motions: Sequence[Control]) -> AirRun:
+def run_in_air(
+    scenario: Scenario,
+    rig: Rig,
+    motions: Sequence[Control],
+    show: Callable[[int, int], object] = lambda _done, _count: None,
+) -> AirRun:
     """Carry out motions; the driver is stopped at their end and after any error.
+
+    show: called after each motion with the number of those done, and of all.
 
     Raises RunError if the tip comes near the skin or is no longer measured, DriverError if a motion is not completed.
     """
@@ -43,9 +50,9 @@ def run_in_air(scenario: Scenario, rig: Rig, motions: Sequence[Control]) -> AirR
 
     try:
         read()
-        for planned in motions:
+        for done, planned in enumerate(motions, 1):
             # Motors of whole steps have advanced a little less, and may not withdraw beyond the start.
-            advanced = sum(done.applied.db_x for done in moves)
+            advanced = sum(one.applied.db_x for one in moves)
             ahead = min(max(planned.db_x, -advanced), max(0.0, _room(scenario, measurements) - advanced))
             motion = _carry_out(scenario, rig, planned._replace(db_x=ahead))
             if motion.held:
@@ -53,6 +60,7 @@ def run_in_air(scenario: Scenario, rig: Rig, motions: Sequence[Control]) -> AirR
             moves.extend(Move.parts_of(motion))
             read()
             _require_air(scenario, measurements, rig.clock.now())
+            show(done, len(motions))
         late = _LATE_S + max((one.delay_s for one in scenario.sensor), default=0.0)
         moves.append(Move.of(_rest(rig, late)))
         read()

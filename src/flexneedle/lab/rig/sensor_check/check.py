@@ -1,6 +1,6 @@
 """Check of the sensors along the needle in air, on a virtual rig or on the rig of a rig file."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -25,8 +25,10 @@ def choose_sensors(scenario: Scenario, name: str | None) -> Scenario:
     return scenario.model_copy(update={"sensor": chosen})
 
 
-def run_on(source: RigSource, scenario: Scenario, seed: int, stream: Stream) -> AirRun:
-    """Carry out the motions in air on a rig.
+def run_on(
+    source: RigSource, scenario: Scenario, seed: int, stream: Stream, show: Callable[[int, int], object]
+) -> AirRun:
+    """Carry out the motions in air on a rig; show: as for `run_in_air`.
 
     Raises as `RigSource.open`, RunError and DriverError as `run_in_air`.
     """
@@ -34,7 +36,7 @@ def run_on(source: RigSource, scenario: Scenario, seed: int, stream: Stream) -> 
     scenario = scenario.with_values({"guard.past_target_mm": 0.5 * air_margin(scenario)})
     motions = plan_motions(scenario)
     with source.open(scenario, _plan_in_air(scenario, np.array(motions)), seed, stream) as rig:
-        return run_in_air(scenario, rig, motions)
+        return run_in_air(scenario, rig, motions, show)
 
 
 def _plan_in_air(scenario: Scenario, rows: np.ndarray) -> Plan:
