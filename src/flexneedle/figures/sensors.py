@@ -30,6 +30,7 @@ _REASON = 44  # characters
 _NAME = 16  # characters of a sensor's name
 _NAMED = 4  # sensors that are named one by one beside the needle
 _LEAST_NIS = 0.02
+_LOST_MM = 2.0  # way without a good reading of the tracker
 _TURNED = 0.3  # rad; readings of a period with a larger turn are at several angles
 
 
@@ -167,6 +168,9 @@ def _innovations(insertion: Insertion) -> DepthPanel:
         marks += [
             Mark(at, short(f"{shown}: {text}", _REASON), color) for at, text in state_changes(insertion, name)
         ]
+    measured = [one.estimate.x for one in insertion.periods if any(each.verdict.ok for each in one.readings)]
+    if measured and insertion.periods[-1].estimate.x > measured[-1] + _LOST_MM:
+        marks.append(Mark(measured[-1], "tracker: no good reading", look(len(names)).color))
     title = f"Square of innovations (1 on average): ● used, × excluded, mean of {_WINDOW}"
     return DepthPanel(title, lines, _LEAST_NIS, marks=marks, log=True)
 
