@@ -143,6 +143,12 @@ def test_no_rest_is_longer_than_the_slowest_sensor_needs(depth):
     assert np.diff([period.time for period in insertion.periods]).max() < 1.1
 
 
+def test_no_rest_before_the_target_waits_for_a_reading_that_does_not_come():
+    insertion = inserted({"kind": "slice", "plane_mm": 39.0}, phantom__tracker_lost_mm=5.0)
+    assert insertion.outcome == "done"
+    assert np.diff([period.time for period in insertion.periods]).max() < 1.1
+
+
 def test_a_slow_sensor_measures_between_its_readings():
     scenario = planned()[0].with_values({"sensor": [SLICES[0] | {"rate_hz": 2.0}]})
     watch = Watch({"slice 1": SensorMonitor(heard=10.0, measured=True)})
