@@ -71,16 +71,17 @@ def _check(args: argparse.Namespace) -> int:
     from flexneedle.loop.virtual import VirtualRig
     from flexneedle.scenario.files import load_scenario
 
-    scenario, rig = choose_sensors(load_scenario(args.scenario), args.sensor), None
+    scenario, rig = load_scenario(args.scenario), None
+    chosen = choose_sensors(scenario, args.sensor)
     if args.rig is None:
         with Progress() as progress:
-            run = run_on(VirtualRig(), scenario, args.seed, Stream(), _shown(progress))
+            run = run_on(VirtualRig(), scenario, chosen, args.seed, Stream(), _shown(progress))
     else:
         from flexneedle.lab.rig.supervised import SupervisedRig
 
         source = SupervisedRig(args.rig)
-        rig, run = source.file, _run_on_rig(args, source, scenario)
-    fit = fit_in_air(scenario, run)
+        rig, run = source.file, _run_on_rig(args, source, scenario, chosen)
+    fit = fit_in_air(chosen, run)
     errors = find_errors(fit, rig)
     lines, failed = lines_to_paste(errors), any(one.line for one in errors)
     values = {
@@ -99,7 +100,9 @@ def _check(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _run_on_rig(args: argparse.Namespace, source: SupervisedRig, scenario: Scenario) -> AirRun:
+def _run_on_rig(
+    args: argparse.Namespace, source: SupervisedRig, scenario: Scenario, chosen: Scenario
+) -> AirRun:
     """Carry out the motions on a rig, once they are confirmed."""
     from flexneedle.lab.commands.insert import interrupt_on_signals
     from flexneedle.lab.rig.sensor_check.check import run_on
@@ -111,8 +114,8 @@ def _run_on_rig(args: argparse.Namespace, source: SupervisedRig, scenario: Scena
         ros = source.file.ros
         bridges = () if ros is None else (stack.enter_context(Bridge(ros, print_line)),)
         progress = stack.enter_context(Progress())
-        gate = AllGates(*bridges, _UserGate(scenario, progress, yes=args.yes))
-        return run_on(source, scenario, args.seed, Stream(bridges, gate), _shown(progress))
+        gate = AllGates(*bridges, _UserGate(chosen, progress, yes=args.yes))
+        return run_on(source, scenario, chosen, args.seed, Stream(bridges, gate), _shown(progress))
 
 
 def _shown(progress: Progress) -> Callable[[int, int], None]:

@@ -30,8 +30,9 @@ class BeamSource:
         pass
 
     @contextmanager
-    def open(self, _scenario, plan, _seed, stream):
+    def open(self, scenario, plan, _seed, stream):
         self.plans.append(plan)
+        self.sensors = [one.title for one in scenario.sensor]
         positions = dict.fromkeys(dict(self.file.axes.items()), 0.0)
         stream.gate.confirm(SimpleNamespace(rig=self.file, positions=positions, take_signals=lambda: None))
         yield self.needle.ports
@@ -59,6 +60,23 @@ def test_a_delay_is_found_on_a_rig_with_the_line_that_corrects_it(capsys, scenar
     assert not found["ok"]
     plan = BeamSource.last.plans[0]
     assert plan.target[0] == pytest.approx(-3.0)  # nothing is planned behind the margin before the skin
+
+
+@pytest.mark.usefixtures("rig")
+def test_one_sensor_of_a_rig_is_checked_without_the_motions_of_a_slow_one(capsys, tmp_path):
+    slow = {"kind": "slice", "plane_mm": -5.0, "rate_hz": 0.5}
+    path = tmp_path / "two.toml"
+    path.write_text(
+        tomli_w.dumps(SCENARIO.with_values({"sensor": [SCENARIO.values()["sensor"][0], slow]}).values())
+    )
+    status, printed, _ = run(
+        capsys, "sensor", "check", str(path), "--rig", "emulated", "--yes", "--sensor", "fbg"
+    )
+    assert status == 1
+    assert "delay_s = 0.070" in printed
+    assert "slice" not in printed
+    assert BeamSource.last.sensors == ["fbg", "slice"]
+    assert BeamSource.last.needle.time < 120.0
 
 
 @pytest.mark.usefixtures("rig")

@@ -26,15 +26,20 @@ def choose_sensors(scenario: Scenario, name: str | None) -> Scenario:
 
 
 def run_on(
-    source: RigSource, scenario: Scenario, seed: int, stream: Stream, show: Callable[[int, int], object]
+    source: RigSource,
+    scenario: Scenario,
+    chosen: Scenario,
+    seed: int,
+    stream: Stream,
+    show: Callable[[int, int], object],
 ) -> AirRun:
-    """Carry out the motions in air on a rig; show: as for `run_in_air`.
+    """Carry out the motions in air for the sensors of `chosen` on a rig; show: as for `run_in_air`.
 
     Raises as `RigSource.open`, RunError and DriverError as `run_in_air`.
     """
     # The supervisor stops an advance at the plan's end and what may follow: here within the margin before the skin.
     scenario = scenario.with_values({"guard.past_target_mm": 0.5 * air_margin(scenario)})
-    motions = plan_motions(scenario)
+    motions = plan_motions(chosen)
     with source.open(scenario, _plan_in_air(scenario, np.array(motions)), seed, stream) as rig:
         return run_in_air(scenario, rig, motions, show)
 
