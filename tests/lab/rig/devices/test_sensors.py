@@ -1,5 +1,6 @@
 """Sensors along the needle of a rig file: found, opened for the sensors of the scenario, checked, and closed."""
 
+import math
 import sys
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ from bench_rig import rig, values
 from flexneedle.errors import DriverError, RigError
 from flexneedle.lab.rig.devices.opening import SENSORS, open_sensors
 from flexneedle.lab.rig.preflight.fit import fit_problems
-from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion, check_rig
+from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion, check_rig, check_sensor
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.plugins import load_part
 from flexneedle.scenario.files import load_scenario
@@ -125,6 +126,13 @@ def test_sensors_of_rig_and_scenario_must_be_the_same():
     assert side.startswith('sensor[1].name = "side": ')
     assert 'name = "back"' in back
     assert len(fit_problems(rig(sensor=[table()]), scenario())) == 1
+
+
+def test_a_site_without_any_value_is_a_problem():
+    nan = math.nan
+    broken = SimpleNamespace(status="ok", read=lambda: [Reading(0.0, ((1.0, 2.0), (nan, nan)))])
+    *_, found = check_sensor("sensor fbg", FBG, broken, ManualClock(), 1.0)
+    assert found.problem == "no value in any reading: row 2"
 
 
 def test_two_sensors_of_one_name_are_refused():

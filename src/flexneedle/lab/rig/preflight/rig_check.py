@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import chain
 from math import isfinite
 from statistics import median
 from typing import Any
@@ -292,7 +293,8 @@ def check_sensor(
     shown = f"{'; '.join(rows)} {unit}".rstrip() if rows else "none"
     few = 2 * len(measured) <= len(readings)
     said = readings[-1].status if readings else "no reading"
-    values = Finding(name, "values", shown, f"in less than half of the readings: {said}" * few)
+    problem = f"in less than half of the readings: {said}" if few else _find_dead(measured, wanted)
+    values = Finding(name, "values", shown, problem)
     if readings and not measured and type(wanted).sees is not Sensor.sees:
         values = UncheckedFinding(name, "values", f"none, as of an image without the needle: {said}")
     return [
@@ -300,6 +302,13 @@ def check_sensor(
         Finding(name, "status", status, "must be ok while readings arrive" * (status != VISIBLE)),
         values,
     ]
+
+
+def _find_dead(measured: Sequence[Reading], wanted: Sensor) -> str:
+    """Return the problem of rows without a value in any reading, such as sites of a fibre; images may have such."""
+    rows = zip(*(one.rows for one in measured), strict=False) if type(wanted).sees is Sensor.sees else ()
+    dead = [str(k) for k, each in enumerate(rows, 1) if not any(map(isfinite, chain.from_iterable(each)))]
+    return f"no value in any reading: row {', '.join(dead)}" if dead else ""
 
 
 def _collect(device: Any, clock: Clock, seconds: float) -> list[Any]:
