@@ -69,6 +69,7 @@ def test_with_a_fibre_a_lost_tracker_does_not_end_the_insertion(inserted):
     assert "holding" not in {one["state"] for one in done.ticks["states"]}
 
 
+@pytest.mark.slow
 def test_with_a_fibre_a_distorted_field_does_not_end_the_insertion(inserted):
     done, tip = inserted("aurora:indicator=0.2")
     assert done.outcome == "done"
