@@ -24,6 +24,7 @@ Whole = NDArray[np.int64]
 COLUMNS = ("energy", "stretch", "deflection", "loads", "strain", "clearance", "shapes")
 """Names of the outputs of a rollout besides tips and convergence."""
 _STEPS_WORTH_A_THREAD = 1000
+_SHAPES = 128  # sampled at once
 _MOST_THREADS = 256
 _memory = threading.local()  # scratch memory of each thread: to take new memory costs as much as some steps
 
@@ -129,13 +130,17 @@ def sample_shapes(curves: Floats, nodes: int) -> Floats:
     """Return poses (…, nodes, 5) at equal arc lengths of curves (…, k, 1 + 2 axes) of a rollout."""
     rows = curves.reshape(-1, *curves.shape[-2:])
     across = curves.shape[-1] // 2
-    x = rows[:, :, 0].copy()
-    y, slope = (
-        rows[:, :, k : k + across].copy().view(float if across == 1 else complex)[..., 0]
-        for k in (1, 1 + across)
-    )
     out = np.empty((len(rows), nodes, POSE_SIZE))
-    equal_arc_nodes(x, y, slope, 1 + np.argmax(x >= x[:, -1:], axis=1), out)
+    for first in range(
+        0, len(rows), _SHAPES
+    ):  # large copies would be in fresh pages of memory, which takes as long
+        part = rows[first : first + _SHAPES]
+        x = part[:, :, 0].copy()
+        y, slope = (
+            part[:, :, k : k + across].copy().view(float if across == 1 else complex)[..., 0]
+            for k in (1, 1 + across)
+        )
+        equal_arc_nodes(x, y, slope, 1 + np.argmax(x >= x[:, -1:], axis=1), out[first : first + _SHAPES])
     return out.reshape(*curves.shape[:-2], nodes, POSE_SIZE)
 
 
