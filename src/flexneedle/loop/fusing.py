@@ -214,7 +214,7 @@ def _silence(scenario: Scenario, watch: Watch, now: float) -> float:
     if not any(one.measured for one in watch.monitors.values()):
         return math.inf
     good = (one for one in scenario.sensor if watch.of(one.title).excluded.ok)
-    ages = (now - watch.of(one.title).heard - one.delay_s - 1.0 / one.rate_hz for one in good)
+    ages = (now - watch.of(one.title).heard - one.longest_wait for one in good)
     return min(ages, default=math.inf)
 
 

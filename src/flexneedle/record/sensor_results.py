@@ -127,7 +127,7 @@ def _silent_mm(scenario: Scenario | None, name: str, steps: list[tuple[Period, S
     if scenario is None or sensor is None:
         return math.nan
     good = [[one.reading.time for one in state.readings if one.verdict.ok] for _, state in steps]
-    limit = scenario.control.stale_after_s + sensor.delay_s + 1.0 / sensor.rate_hz
+    limit = scenario.control.stale_after_s + sensor.longest_wait
     if type(sensor).sees is not Sensor.sees and not any(good):
         return math.nan
     return _silent([period for period, _ in steps], good, limit)

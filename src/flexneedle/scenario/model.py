@@ -185,8 +185,7 @@ class Scenario(Section):
     @property
     def longest_wait(self) -> float:
         """Time (s) within which the slowest sensor along the needle sends a reading; later none is awaited."""
-        slowest = max((one.delay_s + 1.0 / one.rate_hz for one in self.sensor), default=0.0)
-        return self.control.stale_after_s + slowest
+        return self.control.stale_after_s + max((one.longest_wait for one in self.sensor), default=0.0)
 
     def energy_scale(self, depth: float) -> float:
         """Return E₁, the energy (mJ) of all tissue down to `depth` (mm) displaced by 1 mm, weighted by layer."""

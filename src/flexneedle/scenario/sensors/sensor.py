@@ -108,6 +108,11 @@ class Sensor(Section):
         return self.name or self.kind.rpartition(":")[2]
 
     @property
+    def longest_wait(self) -> float:
+        """Longest time (s) from the measurement of a reading to the arrival of the next one."""
+        return self.delay_s + 1.0 / self.rate_hz
+
+    @property
     def noise(self) -> float:
         """Standard deviation of the white noise of a value, above 0."""
         raise NotImplementedError

@@ -77,7 +77,7 @@ def describe_motions(scenario: Scenario) -> Sequence[str]:
         *lines,
         f"rotation: {turned} and back, twice",
         f"insertion: {along:.1f} mm forward, to {air_margin(scenario):.1f} mm before the skin, and back",
-        *[f"There {part}_y sweeps from side to side, for slow sensors many times."] * (reach > 0.0),
+        *[f"{part}_y: from side to side there, more often for a slow sensor"] * (reach > 0.0),
         f"All of this in about {motion_time(scenario, plan_motions(scenario)):.0f} s.",
         "Only with the needle in air, free by these distances.",
     ]

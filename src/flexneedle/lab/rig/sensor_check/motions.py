@@ -95,8 +95,8 @@ def _motions(scenario: Scenario) -> Iterator[Control]:
     yield from along
     if reach:
         across, back = (tuple(_steps(f"{part}_y", goal, step)) for goal in (-2.0 * reach, 2.0 * reach))
-        aside = tuple(_steps(f"{part}_y", reach, step))
-        yield from (*across, *back) * (count_sweeps(scenario, (*aside, *along), across) // 2)
+        outward = tuple(_steps(f"{part}_y", reach, step))
+        yield from (*across, *back) * (count_sweeps(scenario, (*outward, *along), across) // 2)
     yield from _steps("db_x", -way, setup.max_advance_mm)
     yield from _steps(f"{part}_y", -reach, step)
 
